@@ -2,13 +2,25 @@
 
 from __future__ import annotations
 
+from solvers.generalized_reflections import GeneralizedReflections
+from solvers.lcp_qp import NewtonLcpNnls
+from solvers.newton_lcp import NewtonLcp
+from solvers.pairwise import GaussSeidel, Jacobi
 from solvers.problem import ImpactProblem, ProblemError
+from solvers.qce_lcp import QceBlend, QceLcp
 from solvers.quadratic_contact_energy import DeferredContactEnergy, QuadraticContactEnergy
 from solvers.solution import ImpactSolution, Solver, Status, UnsupportedProblem
 
 SOLVERS: dict[str, type[Solver]] = {
+    "gauss-seidel": GaussSeidel,
+    "gr": GeneralizedReflections,
+    "jacobi": Jacobi,
+    "lcp-nnls": NewtonLcpNnls,
+    "lcp-pgs": NewtonLcp,
     "qce": QuadraticContactEnergy,
+    "qce-blend": QceBlend,
     "qce-defer": DeferredContactEnergy,
+    "qce-lcp": QceLcp,
 }
 """Name → law. Adding one is one file and one line here."""
 
