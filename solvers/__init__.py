@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from solvers.generalized_reflections import GeneralizedReflections
+from solvers.hertz import Hertz
 from solvers.lcp_qp import NewtonLcpNnls
+from solvers.liu_zhao_brogliato import LiuZhaoBrogliato
 from solvers.newton_lcp import NewtonLcp
 from solvers.pairwise import GaussSeidel, Jacobi
 from solvers.problem import ImpactProblem, ProblemError
@@ -14,9 +16,11 @@ from solvers.solution import ImpactSolution, Solver, Status, UnsupportedProblem
 SOLVERS: dict[str, type[Solver]] = {
     "gauss-seidel": GaussSeidel,
     "gr": GeneralizedReflections,
+    "hertz": Hertz,
     "jacobi": Jacobi,
     "lcp-nnls": NewtonLcpNnls,
     "lcp-pgs": NewtonLcp,
+    "lzb": LiuZhaoBrogliato,
     "qce": QuadraticContactEnergy,
     "qce-blend": QceBlend,
     "qce-defer": DeferredContactEnergy,

@@ -60,7 +60,8 @@ class GeneralizedReflections:
         v_post = problem.v_after(impulse, friction_impulse)
         if not np.isfinite(v_post).all():
             status = Status.NOT_FINITE
-        residual = max(-float((problem.J @ v_post).min(initial=0.0)), 0.0) / (problem.speed or 1.0)
+        u_min = float((problem.J @ v_post).min(initial=0.0))
+        residual = max(-u_min, 0.0) / (problem.speed or 1.0)
         return ImpactSolution(impulse, v_post, status, iterations, visits, residual, friction_impulse)
 
     def _reflect(self, problem: ImpactProblem) -> tuple[Floats, Status, int, int]:

@@ -75,30 +75,16 @@ class ImpactProblem:
         stiffness: npt.ArrayLike = 1.0,
     ) -> None:
         self.v_pre: Floats = _vector("v_pre", v_pre)
-        n = self.v_pre.size
         self.J: Matrix = _matrix("J", J)
-        if self.J.shape[1] != n:
-            raise ProblemError(
-                f"J must have one column for each entry of v_pre: {self.J.shape[1]} columns, {n} entries"
-            )
-        m = self.J.shape[0]
+        m, n = self.J.shape[0], self.v_pre.size
+        self.restitution: Floats = _restitution(restitution, m)
+        self.friction: Floats = _friction(friction, m)
+        self.stiffness: Floats = _stiffness(stiffness, m)
+        self.D: Matrix | None = None if D is None else _matrix("D", D)
+        if self.D is not None and self.D.shape != (2 * m, n):
+            raise ProblemError(f"D must have shape (2m, n) = ({2 * m}, {n}), not {self.D.shape}")
+        self._check_together()
         self.inverse_mass: Matrix = _inverse_mass(inverse_mass, n)
-        self.restitution: Floats = _per_contact("restitution", restitution, m)
-        if m and (self.restitution.min() < 0 or self.restitution.max() > 1):
-            raise ProblemError(f"restitution must lie in [0, 1]: {_worst(self.restitution, 0.0, 1.0)}")
-        self.friction: Floats = _per_contact("friction", friction, m)
-        if m and self.friction.min() < 0:
-            raise ProblemError(f"friction must be ≥ 0: {_worst(self.friction, 0.0, np.inf)}")
-        self.stiffness: Floats = _per_contact("stiffness", stiffness, m)
-        if m and self.stiffness.min() <= 0:
-            raise ProblemError(f"stiffness must be > 0: {_worst(self.stiffness, np.nextafter(0, 1), np.inf)}")
-        self.D: Matrix | None = None
-        if D is not None:
-            self.D = _matrix("D", D)
-            if self.D.shape != (2 * m, n):
-                raise ProblemError(f"D must have shape (2m, n) = ({2 * m}, {n}), not {self.D.shape}")
-        elif m and self.friction.max() > 0:
-            raise ProblemError("friction > 0 needs D, the friction pyramid directions of shape (2m, n)")
         dead = np.flatnonzero(self.W_diagonal <= 0)
         if dead.size:
             raise ProblemError(
@@ -140,20 +126,35 @@ class ImpactProblem:
         friction: npt.ArrayLike | None = None,
         stiffness: npt.ArrayLike | None = None,
     ) -> ImpactProblem:
-        """Return the same bodies and contacts with other numbers; W and the mass matrix are not computed again."""
-        other = ImpactProblem(
-            self.inverse_mass,
-            self.J,
-            self.v_pre if v_pre is None else v_pre,
-            self.restitution if restitution is None else restitution,
-            self.friction if friction is None else friction,
-            self.D,
-            self.stiffness if stiffness is None else stiffness,
-        )
-        for name in ("JM", "DM", "JT", "MJT", "W", "W_diagonal", "mass"):
-            if name in self.__dict__:
-                other.__dict__[name] = self.__dict__[name]
+        """Return the same bodies and contacts with other numbers; nothing that these leave alone is computed again."""
+        other = object.__new__(ImpactProblem)
+        other.__dict__.update(self.__dict__)
+        if v_pre is not None:
+            other.v_pre = _vector("v_pre", v_pre)
+            other._forget("u_pre", "speed")
+        if restitution is not None:
+            other.restitution = _restitution(restitution, self.m)
+        if friction is not None:
+            other.friction = _friction(friction, self.m)
+            other._forget("has_friction")
+        if stiffness is not None:
+            other.stiffness = _stiffness(stiffness, self.m)
+        other._check_together()
         return other
+
+    def _forget(self, *names: str) -> None:
+        """Drop cached properties that a new field makes wrong."""
+        for name in names:
+            self.__dict__.pop(name, None)
+
+    def _check_together(self) -> None:
+        """Check what one field asks of another."""
+        if self.v_pre.size != self.J.shape[1]:
+            raise ProblemError(
+                f"J must have one column for each entry of v_pre: {self.J.shape[1]} columns, {self.v_pre.size} entries"
+            )
+        if self.D is None and self.has_friction:
+            raise ProblemError("friction > 0 needs D, the friction pyramid directions of shape (2m, n)")
 
     @property
     def m(self) -> int:
@@ -212,12 +213,12 @@ class ImpactProblem:
         """Normal relative velocity before the impact [m/s], shape (m,), u < 0 approaches."""
         return _frozen(self.J @ self.v_pre)
 
-    @property
+    @cached_property
     def speed(self) -> float:
         """Largest |u_pre| [m/s], the scale of relative tolerances; 0 without contacts."""
         return float(np.abs(self.u_pre).max(initial=0.0))
 
-    @property
+    @cached_property
     def has_friction(self) -> bool:
         """True where any contact has friction > 0."""
         return bool((self.friction > 0).any())
@@ -229,7 +230,7 @@ class ImpactProblem:
 
     def v_after(self, impulse: npt.ArrayLike, friction_impulse: npt.ArrayLike | None = None) -> Floats:
         """Velocity after an impulse: v_pre + M⁻¹(Jᵀ impulse + Dᵀ friction_impulse), shape (n,)."""
-        v: Floats = self.v_pre + self.JM.T @ np.asarray(impulse, dtype=np.float64)
+        v: Floats = self.v_pre + self.MJT @ np.asarray(impulse, dtype=np.float64)
         if friction_impulse is not None:
             v = v + self.DM.T @ np.asarray(friction_impulse, dtype=np.float64)
         return v
@@ -269,6 +270,27 @@ def _per_contact(field: str, value: npt.ArrayLike, m: int) -> Floats:
         raise ProblemError(f"{field} must be a number or have shape (m,) = ({m},), not {array.shape}")
     _check_finite(field, array)
     return _frozen(array.copy())
+
+
+def _restitution(value: npt.ArrayLike, m: int) -> Floats:
+    restitution = _per_contact("restitution", value, m)
+    if m and (restitution.min() < 0 or restitution.max() > 1):
+        raise ProblemError(f"restitution must lie in [0, 1]: {_worst(restitution, 0.0, 1.0)}")
+    return restitution
+
+
+def _friction(value: npt.ArrayLike, m: int) -> Floats:
+    friction = _per_contact("friction", value, m)
+    if m and friction.min() < 0:
+        raise ProblemError(f"friction must be ≥ 0: {_worst(friction, 0.0, np.inf)}")
+    return friction
+
+
+def _stiffness(value: npt.ArrayLike, m: int) -> Floats:
+    stiffness = _per_contact("stiffness", value, m)
+    if m and stiffness.min() <= 0:
+        raise ProblemError(f"stiffness must be > 0: {_worst(stiffness, np.nextafter(0, 1), np.inf)}")
+    return stiffness
 
 
 def _matrix(field: str, value: MatrixLike) -> Matrix:

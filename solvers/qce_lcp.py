@@ -5,8 +5,12 @@
 
 c_r = 0 is the inelastic LCP, c_r = 1 is QCE. The appendix of Zhang 2015 says that the blend solves Eq. 19; it does
 not in general, as complementarity fails where QCE pushes at a contact that the inelastic LCP lets separate. Hence two
-laws. Eq. 19 cannot raise the kinetic energy (one c_r, no friction): v is a projection in the mass norm, see
-`physics` in the README. Friction: Eq. 21, alternating with the boxed LCP of the pyramid.
+laws. Friction: Eq. 21, alternating with the boxed LCP of the pyramid.
+
+Eq. 19 cannot raise the kinetic energy (one c_r, no friction): v is the projection of v_pre, in the mass norm, on
+c_r v_c + C with the cone C = {J v ≥ 0}. Let Π be the projection of v_pre - c_r v_c on C. As v_c - v_pre = M⁻¹Jᵀλ_c
+pairs non-negatively with C, |Π|² = <v_pre - c_r v_c, Π> ≤ (1 - c_r) <v_c, Π> ≤ (1 - c_r) |v_pre| |Π|, hence
+|v| ≤ |Π| + c_r |v_c| ≤ |v_pre|.
 
 Source: Zhang 2015, Section 4.
 """
@@ -22,7 +26,7 @@ from solvers.generalized_reflections import one_restitution
 from solvers.newton_lcp import lcp_solution
 from solvers.problem import ImpactProblem
 from solvers.quadratic_contact_energy import solve_elastic
-from solvers.solution import ImpactSolution, Status
+from solvers.solution import Floats, ImpactSolution, Status
 
 
 @dataclass(frozen=True)
@@ -92,9 +96,7 @@ class QceBlend:
                 return elastic
         return _joined(self._alternate(problem, restitution, elastic_impulse), elastic)
 
-    def _alternate(
-        self, problem: ImpactProblem, restitution: float, elastic_impulse: np.ndarray[tuple[int], np.dtype[np.float64]]
-    ) -> ImpactSolution:
+    def _alternate(self, problem: ImpactProblem, restitution: float, elastic_impulse: Floats) -> ImpactSolution:
         """Normal impulses at given friction, friction at given normal impulses (Eq. 21), until neither changes."""
         rest = np.zeros(problem.m)
         friction_impulse = None

@@ -96,6 +96,16 @@ def test_replace_shares_what_does_not_change() -> None:
     assert other.W is W
     assert other.u_pre.tolist() == [0.5, 1.0]
     assert other.restitution.tolist() == [0.5, 0.5]
+    assert problem.speed == 1.0
+    assert problem.replace(v_pre=2.0 * VELOCITY).speed == 2.0
+    assert not problem.has_friction
+    rough = ImpactProblem(np.ones(3), CHAIN, VELOCITY, D=np.zeros((4, 3))).replace(friction=0.5)
+    assert rough.has_friction
+    assert not rough.replace(friction=0.0).has_friction
+    with pytest.raises(ProblemError, match="friction > 0 needs D"):
+        problem.replace(friction=0.5)
+    with pytest.raises(ProblemError, match="one column for each entry of v_pre"):
+        problem.replace(v_pre=[1.0])
     with pytest.raises(ProblemError, match="restitution"):
         problem.replace(restitution=1.5)
 
