@@ -148,6 +148,10 @@ def _integrate(
         )  # fmt: skip
     else:
         J, JM, JT = problem.J, problem.JM, problem.JT
+        # Contacts that press together on a body are as stiff as the sum of them: on a box with 1,000 points a contact
+        # lasts a sixteenth of a pair's. The row sums of |W| bound it, computed without W.
+        together = abs(J) @ (abs(JM).T @ np.ones(problem.m))
+        shortest *= float((problem.W_diagonal / together).min()) ** (1.0 / (exponent + 1.0))
         impulse, compressed, steps, visits, finished = _leapfrog(
             J.indptr, J.indices, J.data, JM.indptr, JM.indices, JM.data / w, JT.indptr, JT.indices, problem.v_pre / V,
             stiffness, recovery, deepest, exponent, deepest_gap, threshold, shortest / steps_per_contact, max_visits,

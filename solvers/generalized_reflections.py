@@ -62,6 +62,9 @@ class GeneralizedReflections:
             status = Status.NOT_FINITE
         u_min = float((problem.J @ v_post).min(initial=0.0))
         residual = max(-u_min, 0.0) / (problem.speed or 1.0)
+        if problem.has_friction:
+            # The friction solve moves the normal velocities, and the law has no second look at them.
+            status = _worse(status, residual, self.tolerance)
         return ImpactSolution(impulse, v_post, status, iterations, visits, residual, friction_impulse)
 
     def _reflect(self, problem: ImpactProblem) -> tuple[Floats, Status, int, int]:

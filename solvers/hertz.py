@@ -39,7 +39,7 @@ class Hertz:
     """Error of one step of the adaptive method, relative to the largest speed and compression (small problems)."""
 
     steps_per_contact: float = 50.0
-    """Leapfrog steps within the shortest contact of a pair (large problems)."""
+    """Leapfrog steps within the shortest contact, all neighbors pressing with it (large problems)."""
 
     adaptive_contacts: int = ADAPTIVE_CONTACTS
     """Problems of up to so many contacts are small."""

@@ -17,7 +17,7 @@ Source: Zhang 2015, Section 4.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -122,7 +122,13 @@ class QceBlend:
             if change <= self.tolerance or sweeps >= self.max_sweeps:
                 break
         result = boxed_lcp.LcpResult(impulse, friction_impulse, v_start, sweeps, visits, residual)
-        return lcp_solution(problem, result, self.tolerance)
+        solution = lcp_solution(problem, result, self.tolerance)
+        if solution.status is Status.CONVERGED and problem.has_friction:
+            # Friction moves the normal velocities of QCE's share, which nothing pushes back.
+            u_min = float((problem.J @ solution.v_post).min(initial=0.0))
+            if u_min < -self.qce_tolerance * problem.speed:
+                return replace(solution, status=Status.STALLED)
+        return solution
 
 
 def _joined(solution: ImpactSolution, elastic: ImpactSolution | None) -> ImpactSolution:
