@@ -1,0 +1,728 @@
+"""impactbench: measure laws of multi-impact against what an impact must do. The command line, and the names to import.
+
+    impactbench scorecard                      measure, and read the card
+    from impactbench import SOLVERS, ImpactProblem, CATALOG
+
+Everything below is imported when it is used, so that `--help` answers at once.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import shlex
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import click
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from rich.console import Console
+    from rich.progress import Progress as ProgressBar
+    from rich.progress import TaskID
+
+    from harness.measure import measure_impact, measure_sweep
+    from harness.measurement import Measurement, Score, Verdict
+    from harness.run import Progress, Summary
+    from harness.selection import SolverChoice
+    from harness.store import PlannedTask, Store
+    from scenarios import CATALOG
+    from scenarios.scenario import Reference, Scenario
+    from solvers import SOLVERS, ImpactProblem, ImpactSolution, ProblemError, Solver, Status, UnsupportedProblem
+
+_HOMES = {
+    "CATALOG": "scenarios",
+    "ImpactProblem": "solvers",
+    "ImpactSolution": "solvers",
+    "Measurement": "harness.measurement",
+    "ProblemError": "solvers",
+    "Reference": "scenarios.scenario",
+    "SOLVERS": "solvers",
+    "Scenario": "scenarios.scenario",
+    "Score": "harness.measurement",
+    "Solver": "solvers",
+    "Status": "solvers",
+    "Store": "harness.store",
+    "UnsupportedProblem": "solvers",
+    "Verdict": "harness.measurement",
+    "measure_impact": "harness.measure",
+    "measure_sweep": "harness.measure",
+}
+"""Facade name → module that has it."""
+
+__all__ = [
+    "CATALOG", "ImpactProblem", "ImpactSolution", "Measurement", "ProblemError", "Reference", "SOLVERS", "Scenario",
+    "Score", "Solver", "Status", "Store", "UnsupportedProblem", "Verdict", "main", "measure_impact", "measure_sweep",
+]  # fmt: skip
+
+EXIT_FAILED_TASKS = 1
+EXIT_BAD_INPUT = 2
+EXIT_INTERRUPTED = 130
+# Where there is no terminal (a log file, CI) a line this often shows that the run is alive [s].
+PLAIN_PROGRESS_S = 5.0
+# Failures shown one by one at the end; the others are in the report.
+SHOWN_FAILURES = 10
+# Rows that stand behind a claim, as far as they are named.
+SHOWN_ROWS = 4
+# Entries of a vector that `replay` prints.
+SHOWN_ENTRIES = 24
+
+EXIT_CODES = """
+\b
+Exit codes:
+  0    every task was measured or refused by its solver (verdicts do not change the exit code)
+  1    a task crashed, timed out, ran out of memory, raised, or gave an invalid answer
+  2    bad usage or input: unknown names, an unusable results folder
+  130  interrupted; the same command goes on where it stopped
+"""
+
+# "\b" in a docstring keeps click from filling the paragraph below it (hence D301 is off there).
+Command = TypeVar("Command", bound=Callable[..., Any])
+
+
+def __getattr__(name: str) -> object:
+    """Import a facade name when it is first used."""
+    if name in _HOMES:
+        _prepare()
+        return getattr(importlib.import_module(_HOMES[name]), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+class BadInput(click.ClickException):
+    """What the user asked for cannot be done; the text says why and what to do."""
+
+    exit_code = EXIT_BAD_INPUT
+
+
+class _Version:
+    """Looks the version up only when it is asked for."""
+
+    def __call__(self, context: click.Context, _parameter: click.Parameter, asked: bool) -> None:
+        if asked and not context.resilient_parsing:
+            from harness.environment import package_version
+
+            click.echo(f"impactbench {package_version()}")
+            context.exit()
+
+
+@click.group(
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
+    epilog=EXIT_CODES,
+)
+@click.option(
+    "--version", is_flag=True, is_eager=True, expose_value=False, callback=_Version(), help="Show the version and exit."
+)
+def main() -> None:
+    """Measure laws of multi-impact: what happens when many touching bodies are struck at once.
+
+    Every law (solver) meets every scene; each answer is scored on six desiderata (WAV, BRK, SYM, KIN, MOM, ONE), on
+    robustness, invariance and termination, and against references. All numbers are kept in one results folder.
+
+    \b
+    Start here:
+      impactbench scorecard                      measure the default tier, print the card, draw the figures
+      impactbench scorecard --tier smoke         the same in seconds, on a few scenes
+      impactbench list                           what there is to measure
+      impactbench replay qce three-ball-chain:va=0.5
+                                                 one solver on one scene, with all its numbers
+    """  # noqa: D301
+
+
+def _selection_options(command: Command) -> Command:
+    """Options that say what is measured."""
+    for option in (
+        click.option("--tier", default="default", show_default=True, help="Set of scenes: smoke, default or full."),
+        click.option(
+            "--scenario", "scenarios", multiple=True, metavar="NAME[:KEY=VALUE,…]",
+            help="Only this family, member or sweep; patterns as 'pool-*' too. Repeatable.",
+        ),
+        click.option(
+            "--solver", "solvers", multiple=True, metavar="NAME[:KEY=VALUE,…]",
+            help="Only this solver: a name, or path.py:Class for your own. Repeatable. Default: all.",
+        ),
+    ):  # fmt: skip
+        command = option(command)
+    return command
+
+
+def _run_options(command: Command) -> Command:
+    """Options that say how it is measured, and where results go."""
+    for option in (
+        click.option("--fresh", is_flag=True, help="Set earlier results aside (renamed, not deleted) and start anew."),
+        click.option(
+            "--memory", "memory_mb", type=click.FloatRange(min=1), default=4096, show_default=True, metavar="MIB",
+            help="Memory that one task may allocate.",
+        ),
+        click.option(
+            "--timeout", "timeout_s", type=click.FloatRange(min=0, min_open=True), default=120, show_default=True,
+            metavar="SECONDS", help="Time that one task may take; then its process is killed.",
+        ),
+        click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Base of all seeds."),
+        click.option(
+            "--jobs", type=click.IntRange(min=1), default=None, metavar="N",
+            help="Tasks at a time. Default: the number of cores.",
+        ),
+        _out_option,
+    ):  # fmt: skip
+        command = option(command)
+    return command
+
+
+def _out_option(command: Command) -> Command:
+    """The results folder."""
+    return click.option(
+        "--out", type=click.Path(file_okay=False, path_type=Path), default=Path("results"), show_default=True,
+        help="Results folder.",
+    )(command)  # fmt: skip
+
+
+@main.command(epilog=EXIT_CODES)
+@_selection_options
+@_run_options
+@click.option("--no-figures", is_flag=True, help="Write the tables only.")
+def scorecard(out: Path, no_figures: bool, **options: Any) -> None:
+    """Measure a tier and print the scorecard.
+
+    Measured rows are kept in OUT/results.sqlite as they come: an interrupted run goes on where it stopped when the
+    same command is given again. Then tables (Markdown, LaTeX, CSV) and figures (PDF, SVG, PNG) are written into OUT.
+
+    \b
+    Examples:
+      impactbench scorecard
+      impactbench scorecard --tier smoke --out /tmp/smoke
+      impactbench scorecard --solver qce --solver my_law.py:MyLaw --scenario 'pool-*'
+      impactbench scorecard --solver qce:tolerance=1e-8 --scenario three-ball-chain:va=0.25
+    """  # noqa: D301
+    with _explained_errors():
+        failures = _measure(out, **options)
+        _write_reports(out, _tables_only if no_figures else _tables_and_what_can_be_drawn)
+    sys.exit(EXIT_FAILED_TASKS if failures else 0)
+
+
+@main.command(epilog=EXIT_CODES)
+@_selection_options
+@_run_options
+def run(out: Path, **options: Any) -> None:
+    """Measure and store, without a report.
+
+    \b
+    Examples:
+      impactbench run --tier full --jobs 8 --out full
+      impactbench run --solver my_law.py:MyLaw      add a solver to the results in ./results
+    """  # noqa: D301
+    with _explained_errors():
+        failures = _measure(out, **options)
+    sys.exit(EXIT_FAILED_TASKS if failures else 0)
+
+
+@main.command()
+@_out_option
+def figures(out: Path) -> None:
+    """Write tables and figures again from the results in OUT; nothing is measured.
+
+    \b
+    Example:
+      impactbench figures --out results
+    """  # noqa: D301
+    with _explained_errors():
+        _write_reports(out, _tables_and_figures)
+
+
+@main.command()
+@_out_option
+def claims(out: Path) -> None:
+    """Print the paper's claims beside what was measured in OUT.
+
+    Zhang et al. 2015 is the paper. A verdict is derived from the stored rows that stand beside it, never written here.
+
+    \b
+    Example:
+      impactbench claims --out results
+    """  # noqa: D301
+    with _explained_errors():
+        from rich.table import Table
+
+        from harness.claims import check_claims
+        from harness.results import Results
+
+        with _open(out) as store:
+            findings = check_claims(Results(store))
+        table = Table(title="Claims", show_lines=True)
+        for heading in ("claim", "where", "measured", "finding"):
+            table.add_column(heading, overflow="fold")
+        for finding in findings:
+            claim, evidence = finding.claim, finding.evidence
+            shown = evidence.rows[:SHOWN_ROWS]
+            more = ", …" if len(evidence.rows) > len(shown) else ""
+            rows = f"\n({', '.join(shown)}{more})" if shown else ""
+            table.add_row(
+                claim.statement, f"{claim.source}, {claim.where}", evidence.verdict.value, evidence.summary + rows
+            )
+        _console().print(table)
+
+
+@main.command(name="list")
+@click.argument("what", type=click.Choice(["solvers", "scenarios", "sweeps", "tiers"]), required=False)
+def list_names(what: str | None) -> None:
+    """List solvers with their settings, scenarios with their parameters, sweeps, tiers.
+
+    \b
+    Examples:
+      impactbench list
+      impactbench list scenarios
+    """  # noqa: D301
+    with _explained_errors():
+        sections: dict[str, Callable[[], None]] = {
+            "solvers": _list_solvers, "scenarios": _list_scenarios, "sweeps": _list_sweeps, "tiers": _list_tiers,
+        }  # fmt: skip
+        for name in [what] if what else sections:
+            click.secho(name.upper(), bold=True)
+            sections[name]()
+            click.echo()
+
+
+@main.command()
+@_out_option
+@click.option(
+    "--table", type=click.Choice(["results", "tasks", "scores", "series", "runs"]), default="results",
+    show_default=True, help="'results' is every score beside its task.",
+)  # fmt: skip
+@click.option("--format", "form", type=click.Choice(["csv", "json", "parquet"]), default="csv", show_default=True)
+@click.option("--to", type=click.Path(dir_okay=False, path_type=Path), help="File to write. Default: standard output.")
+def export(out: Path, table: Any, form: str, to: Path | None) -> None:
+    """Write one table of the results in OUT for use elsewhere.
+
+    In CSV, structured columns are JSON text. In JSON, missing numbers are null and infinite ones "inf" or "-inf".
+    Parquet needs pyarrow.
+
+    \b
+    Examples:
+      impactbench export > results.csv
+      impactbench export --table tasks --format json --to tasks.json
+    """  # noqa: D301
+    with _explained_errors():
+        with _open(out) as store:
+            frame = store.frame(table)
+        if form == "parquet":
+            _export_parquet(frame, to)
+            return
+        text = _as_csv(frame) if form == "csv" else _as_json(frame)
+        if to is None:
+            click.echo(text, nl=False)
+        else:
+            _write_text(to, text)
+
+
+@main.command()
+@click.argument("solver")
+@click.argument("scenario")
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Base of all seeds.")
+def replay(solver: str, scenario: str, seed: int) -> None:
+    """Run SOLVER on SCENARIO here, in this process, and print velocities and all scores.
+
+    What the solver prints is seen, and a debugger can stop in it. Nothing is stored. The seed is the one that a run
+    with the same --seed uses, so the numbers are the stored ones.
+
+    \b
+    Examples:
+      impactbench replay qce three-ball-chain:va=0.5
+      impactbench replay my_law.py:MyLaw newtons-cradle:balls=5
+    """  # noqa: D301
+    with _explained_errors():
+        from harness.selection import build_scenario, choose_scenarios, choose_solver
+        from solvers import UnsupportedProblem
+
+        choice = choose_solver(solver)
+        families = choose_scenarios(scenario)
+        if len(families) != 1:
+            raise BadInput(f"{scenario} names {len(families)} families; name one")
+        scene = build_scenario(families[0].name, families[0].parameters)
+        try:
+            _print_replay(choice, scene, seed)
+        except UnsupportedProblem as error:
+            raise click.ClickException(f"{solver} refuses {scene.label}: {error}") from error
+
+
+def _measure(
+    out: Path,
+    *,
+    solvers: tuple[str, ...],
+    scenarios: tuple[str, ...],
+    tier: str,
+    jobs: int | None,
+    seed: int,
+    timeout_s: float,
+    memory_mb: float,
+    fresh: bool,
+) -> int:
+    """Plan and measure; returns the number of tasks without an answer."""
+    from harness.environment import available_cores
+    from harness.isolation import Limits
+    from harness.run import measure
+
+    plan = _plan(solvers, scenarios, tier, seed)
+    if fresh:
+        _set_aside(out)
+    workers = jobs or available_cores()
+    click.echo(
+        f"{len(plan)} tasks: {len({planned.task.solver for planned in plan})} solvers, "
+        f"{len({(planned.task.kind, planned.label) for planned in plan})} scenes and sweeps; {workers} at a time; "
+        f"results go to {out / 'results.sqlite'}",
+        err=True,
+    )
+    try:
+        with _terminated_as_interrupted(), _progress_display() as display:
+            summary = measure(
+                out, plan, seed=seed, jobs=workers, limits=Limits(timeout_s, memory_mb), command=_command_line(),
+                on_progress=display,
+            )  # fmt: skip
+    except KeyboardInterrupt:
+        click.echo(
+            f"\ninterrupted; what was measured is in {out}. The same command goes on where it stopped:\n"
+            f"  {_command_line(without='--fresh')}",
+            err=True,
+        )
+        sys.exit(EXIT_INTERRUPTED)
+    _print_summary(out, summary)
+    return len(summary.lost)
+
+
+def _plan(solvers: tuple[str, ...], scenarios: tuple[str, ...], tier: str, seed: int) -> list[PlannedTask]:
+    """Turn the user's names into tasks."""
+    from harness.run import plan_tasks
+    from harness.selection import available_solvers, choose_scenarios, choose_solver
+    from harness.sweeps import SWEEPS
+
+    # A solver that is named twice takes part once.
+    chosen = {
+        choice.specification: choice for choice in (choose_solver(name) for name in solvers or available_solvers())
+    }
+    scenes = [choice for name in scenarios for choice in choose_scenarios(name, tuple(SWEEPS))]
+    plan = plan_tasks(list(chosen.values()), tier=tier, scenarios=scenes, seed=seed)
+    if not plan:
+        raise BadInput("nothing to measure: no scene was chosen")
+    return plan
+
+
+def _set_aside(out: Path) -> None:
+    from harness.store import set_aside
+
+    aside = set_aside(out)
+    if aside is not None:
+        click.echo(f"earlier results are now in {aside}", err=True)
+
+
+def _print_summary(out: Path, summary: Summary) -> None:
+    """Say what the tasks came to, and name those that were lost."""
+    counts = ", ".join(f"{count} {outcome.value}" for outcome, count in summary.outcomes.items())
+    click.echo(f"{sum(summary.outcomes.values())} tasks are done: {counts}", err=True)
+    for line in summary.lost[:SHOWN_FAILURES]:
+        click.secho(f"  {line}", fg="red", err=True)
+    if len(summary.lost) > SHOWN_FAILURES:
+        more = len(summary.lost) - SHOWN_FAILURES
+        click.echo(f"  and {more} more: impactbench export --table tasks --out {out}", err=True)
+
+
+@contextmanager
+def _terminated_as_interrupted() -> Iterator[None]:
+    """Let a polite kill (a batch system at its time limit) end the run as Ctrl-C does."""
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+@contextmanager
+def _progress_display() -> Iterator[Callable[[Progress], None]]:
+    """A bar on a terminal, lines elsewhere; both on standard error, so that the card can be piped."""
+    if not sys.stderr.isatty():
+        yield _PlainProgress()
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import Progress as ProgressBar
+
+    columns = (
+        BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("{task.fields[failures]}"),
+        TextColumn("{task.description}", markup=False),
+    )  # fmt: skip
+    with ProgressBar(*columns, console=Console(stderr=True)) as bar:
+        yield _BarProgress(bar)
+
+
+class _BarProgress:
+    """Progress as a bar with the tasks in hand."""
+
+    def __init__(self, bar: ProgressBar) -> None:
+        self._bar = bar
+        self._row: TaskID = bar.add_task("starting", total=None, failures="")
+
+    def __call__(self, progress: Progress) -> None:
+        self._bar.update(self._row, total=progress.total, completed=progress.done)
+        self._bar.update(self._row, failures=f"{progress.failures} failed" if progress.failures else "")
+        if progress.in_hand:
+            self._bar.update(self._row, description=", ".join(progress.in_hand))
+
+
+class _PlainProgress:
+    """Progress as lines: every failure, and one line every few seconds."""
+
+    def __init__(self) -> None:
+        self._last = time.monotonic()
+
+    def __call__(self, progress: Progress) -> None:
+        from harness.run import FAILURES, describe
+
+        if progress.ended and progress.ending and progress.ending.outcome in FAILURES:
+            click.echo(
+                f"{describe(progress.ended)}: {progress.ending.outcome.value}: {progress.ending.reason}", err=True
+            )
+        now = time.monotonic()
+        if now - self._last >= PLAIN_PROGRESS_S and progress.in_hand:
+            self._last = now
+            click.echo(
+                f"{progress.done}/{progress.total} done, {progress.failures} failed, {progress.elapsed_s:.0f} s; "
+                f"in hand: {', '.join(progress.in_hand)}",
+                err=True,
+            )
+
+
+def _write_reports(out: Path, write: Callable[[Store, Path], list[Path]]) -> None:
+    """Print the scorecard, write the reports, and say what was written."""
+    from reports.tables import render_terminal
+    from reports.tables import scorecard as add_up
+
+    with _open(out) as store:
+        render_terminal(add_up(store), _console())
+        written = write(store, out)
+    click.echo(f"\nmeasured rows: {store.path}\nwritten to {out}:")
+    for path in written:
+        click.echo(f"  {path.relative_to(out) if path.is_relative_to(out) else path}")
+
+
+def _tables_only(store: Store, folder: Path) -> list[Path]:
+    from reports.tables import write_tables
+
+    return list(write_tables(store, folder))
+
+
+def _tables_and_figures(store: Store, folder: Path) -> list[Path]:
+    from reports.figures import write_figures
+
+    return [*_tables_only(store, folder), *write_figures(store, folder, progress=_say)]
+
+
+def _tables_and_what_can_be_drawn(store: Store, folder: Path) -> list[Path]:
+    """As `_tables_and_figures`, for results that may be too few for any figure: the card is written all the same."""
+    from reports.figures import write_figures
+    from reports.scorecard import ReportError
+
+    tables = _tables_only(store, folder)
+    try:
+        return [*tables, *write_figures(store, folder, progress=_say)]
+    except ReportError as error:
+        _say(f"no figures: {error}")
+        return tables
+
+
+def _say(text: str) -> None:
+    """Tell what happens, beside the results."""
+    click.echo(text, err=True)
+
+
+def _list_solvers() -> None:
+    from harness.selection import available_solvers, setting_fields
+
+    for name, law in sorted(available_solvers().items()):
+        settings = ", ".join(f"{key}={value}" for key, value in setting_fields(law).items())
+        _print_entry(name, _first_line(law), settings and f"settings: {settings}")
+
+
+def _list_scenarios() -> None:
+    from scenarios import CATALOG, describe
+
+    for name in CATALOG:
+        call, text = describe(name)
+        _print_entry(name, text, call)
+
+
+def _list_sweeps() -> None:
+    from harness.sweeps import SWEEPS
+
+    for name, sweep in SWEEPS.items():
+        _print_entry(name, _first_line(sweep), "")
+
+
+def _list_tiers() -> None:
+    from scenarios.tiers import TIERS
+
+    for name, scenes in TIERS.items():
+        families = list(dict.fromkeys(family for family, _ in scenes))
+        _print_entry(name, f"{len(scenes)} scenes", f"families: {', '.join(families)}")
+
+
+def _print_entry(name: str, text: str, detail: str) -> None:
+    """One name with its line, and its settings below it."""
+    click.echo(f"  {click.style(f'{name:22}', fg='cyan')} {text}")
+    if detail:
+        click.echo(click.wrap_text(detail, width=110, initial_indent=" " * 25, subsequent_indent=" " * 27))
+
+
+def _first_line(thing: object) -> str:
+    return next(iter((thing.__doc__ or "").strip().splitlines()), "")
+
+
+def _print_replay(choice: SolverChoice, scene: Scenario, seed: int) -> None:
+    """Solve, measure, and print what came out."""
+    from rich.table import Table
+
+    from harness.checked import checked_solve
+    from harness.measure import measure_impact
+    from harness.measurement import Kind
+    from harness.run import task_seed
+
+    console = _console()
+    solution = checked_solve(choice.solver, scene.problem)
+    console.print(f"[bold]{choice.specification}[/] on [bold]{scene.label}[/]: {scene.source}", highlight=False)
+    console.print(
+        f"{solution.status.label} after {solution.iterations} iterations, {solution.visits} contact visits. "
+        f"{solution.status.happened}"
+    )
+    u_post = scene.problem.J @ solution.v_post
+    vectors = {"v_pre": scene.problem.v_pre, "v_post": solution.v_post, "u_pre": scene.problem.u_pre, "u_post": u_post}
+    if solution.impulse is not None:
+        vectors["impulse"] = solution.impulse
+    for name, vector in vectors.items():
+        console.print(f"{name:8} {_vector(vector)}", highlight=False)
+    measured = measure_impact(
+        choice.solver, scene, name=choice.name, seed=task_seed(seed, Kind.IMPACT, scene.name, scene.parameters)
+    )
+    table = Table()
+    for heading in ("score", "metric", "value", "tolerance", "verdict", "reference"):
+        table.add_column(heading)
+    for score in measured.scores:
+        table.add_row(
+            score.name,
+            score.metric,
+            f"{score.value:.3g}",
+            f"{score.tolerance:.3g}",
+            score.verdict.value,
+            score.reference,
+        )
+    console.print(table)
+
+
+def _vector(vector: Any) -> str:
+    """A vector as text, its middle left out where it is long."""
+    numbers = [f"{float(value): .10g}" for value in vector]
+    if len(numbers) > SHOWN_ENTRIES:
+        half = SHOWN_ENTRIES // 2
+        numbers = [*numbers[:half], f" … {len(numbers) - 2 * half} more …", *numbers[-half:]]
+    return " ".join(numbers)
+
+
+def _as_csv(frame: pd.DataFrame) -> str:
+    """A table as CSV; structured cells as JSON text."""
+    import json
+
+    flat = frame.map(lambda value: json.dumps(value, ensure_ascii=False) if isinstance(value, (dict, list)) else value)
+    return str(flat.to_csv(index=False, lineterminator="\n"))
+
+
+def _as_json(frame: pd.DataFrame) -> str:
+    """A table as a list of records, in JSON that every reader takes."""
+    import json
+
+    records = [{key: _strict(value) for key, value in record.items()} for record in frame.to_dict("records")]
+    return json.dumps(records, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def _strict(value: Any) -> object:
+    """Replace what strict JSON does not have: NaN becomes null, infinity a word."""
+    import math
+
+    if isinstance(value, Mapping):
+        return {key: _strict(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_strict(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None if math.isnan(value) else str(value)
+    return value.item() if hasattr(value, "item") else value
+
+
+def _export_parquet(frame: pd.DataFrame, to: Path | None) -> None:
+    import json
+
+    if importlib.util.find_spec("pyarrow") is None:
+        raise BadInput("Parquet needs pyarrow: pip install pyarrow, or choose --format csv")
+    if to is None:
+        raise BadInput("Parquet is no text: name a file with --to")
+    flat = frame.map(lambda value: json.dumps(value, ensure_ascii=False) if isinstance(value, (dict, list)) else value)
+    flat.to_parquet(to, index=False)
+    click.echo(f"written: {to}", err=True)
+
+
+def _write_text(path: Path, text: str) -> None:
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise BadInput(f"cannot write {path}: {error.strerror}") from error
+    click.echo(f"written: {path}", err=True)
+
+
+def _open(out: Path) -> Store:
+    from harness.store import Store
+
+    return Store.open(out)
+
+
+def _console() -> Console:
+    from rich.console import Console
+
+    return Console()
+
+
+def _prepare() -> None:
+    """Make ready what must be ready before a solver is imported."""
+    from harness.environment import ensure_kernel_cache
+
+    ensure_kernel_cache()
+
+
+@contextmanager
+def _explained_errors() -> Iterator[None]:
+    """Turn the errors that a user can do something about into one line and exit code 2."""
+    _prepare()
+    from harness.isolation import IsolationError
+    from harness.measurement import InvalidSolution
+    from harness.results import ResultsError
+    from harness.selection import SelectionError
+    from harness.store import StoreError
+
+    try:
+        yield
+    except (StoreError, SelectionError, ResultsError, IsolationError) as error:
+        raise BadInput(str(error)) from error
+    except InvalidSolution as error:
+        raise click.ClickException(f"invalid answer: {error}") from error
+    except KeyboardInterrupt:
+        click.echo("interrupted", err=True)
+        sys.exit(EXIT_INTERRUPTED)
+
+
+def _command_line(*, without: str = "") -> str:
+    """The command as it was given, for the record; the user's home folder is not part of it."""
+    words = [word for word in sys.argv[1:] if word != without]
+    home = os.path.expanduser("~")
+    return shlex.join(["impactbench", *(word.replace(home, "~") if len(home) > 1 else word for word in words)])
+
+
+if __name__ == "__main__":
+    main(prog_name="impactbench")

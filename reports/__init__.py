@@ -1,1 +1,1 @@
-"""TODO."""
+"""Reports: tables and figures from a results store; nothing here measures."""
