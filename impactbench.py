@@ -66,6 +66,8 @@ EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130
 # Where there is no terminal (a log file, CI) a line this often shows that the run is alive [s].
 PLAIN_PROGRESS_S = 5.0
+# Columns of a table that goes to a file or a pipe.
+PLAIN_WIDTH = 120
 # Failures shown one by one at the end; the others are in the report.
 SHOWN_FAILURES = 10
 # Rows that stand behind a claim, as far as they are named.
@@ -380,7 +382,7 @@ def _measure(
         with _terminated_as_interrupted(), _progress_display() as display:
             summary = measure(
                 out, plan, seed=seed, jobs=workers, limits=Limits(timeout_s, memory_mb), command=_command_line(),
-                on_progress=display,
+                tier=tier, on_progress=display,
             )  # fmt: skip
     except KeyboardInterrupt:
         click.echo(
@@ -684,9 +686,10 @@ def _open(out: Path) -> Store:
 
 
 def _console() -> Console:
+    """The terminal; a file or a pipe has no width, and gets one that the tables fit into."""
     from rich.console import Console
 
-    return Console()
+    return Console() if sys.stdout.isatty() else Console(width=PLAIN_WIDTH)
 
 
 def _prepare() -> None:

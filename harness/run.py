@@ -110,6 +110,7 @@ def measure(
     jobs: int,
     limits: Limits,
     command: str,
+    tier: str,
     on_progress: Callable[[Progress], None],
 ) -> Summary:
     """Store a plan and measure all that is not done yet, in child processes.
@@ -121,6 +122,7 @@ def measure(
         jobs: worker processes.
         limits: of each task.
         command: as it was called, for the record.
+        tier: name of the tier that the plan comes from, for the record.
         on_progress: called at the start, whenever a task ended, and a few times a second between.
 
     Returns:
@@ -136,7 +138,13 @@ def measure(
         run = store.begin_run(
             version=str(environment["impactbench"]),
             environment=environment,
-            settings={"seed": seed, "jobs": jobs, "timeout_s": limits.timeout_s, "memory_mb": limits.memory_mb},
+            settings={
+                "tier": tier,
+                "seed": seed,
+                "jobs": jobs,
+                "timeout_s": limits.timeout_s,
+                "memory_mb": limits.memory_mb,
+            },
             command=command,
         )
         rows = store.plan(plan, run=run)

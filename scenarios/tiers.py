@@ -57,6 +57,7 @@ _BILLIARDS: tuple[Instance, ...] = (
     ("bernoulli", {}),
     ("bernoulli", {"mass_ratio": 12.1}),
     ("bernoulli", {"mass_ratio": 23.3}),
+    ("bernoulli", {"friction": 0.3}),
     ("pool-break", {}),
     ("pool-break", {"balls": 55}),
     ("pool-break", {"rack": "nine-ball"}),

@@ -44,9 +44,8 @@ class Hertz:
     adaptive_contacts: int = ADAPTIVE_CONTACTS
     """Problems of up to so many contacts are small."""
 
-    max_visits: int = 20_000_000
-    """Bound on contact evaluations; a small problem reaches it after about 2 s. A dense pack of 1,000 spheres takes
-    5 to 10 million: raise it for larger ones."""
+    max_visits: int = 4_000_000
+    """Bound on contact evaluations, besides 5,000 for each contact."""
 
     def __post_init__(self) -> None:
         check_settings(self.exponent, self.tolerance, self.steps_per_contact)

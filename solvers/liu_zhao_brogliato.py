@@ -49,8 +49,8 @@ class LiuZhaoBrogliato:
     adaptive_contacts: int = ADAPTIVE_CONTACTS
     """Problems of up to so many contacts are small."""
 
-    max_visits: int = 20_000_000
-    """Bound on contact evaluations; a small problem reaches it after about 2 s."""
+    max_visits: int = 4_000_000
+    """Bound on contact evaluations, besides 5,000 for each contact."""
 
     def __post_init__(self) -> None:
         check_settings(self.exponent, self.tolerance, self.steps_per_contact)

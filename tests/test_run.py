@@ -47,7 +47,7 @@ def run(
     seed: int = 0,
     on_progress: Callable[[Progress], None] = lambda progress: None,
 ) -> dict[str, pd.DataFrame]:
-    measure(folder, plan, seed=seed, jobs=jobs, limits=LIMITS, command="test", on_progress=on_progress)
+    measure(folder, plan, seed=seed, jobs=jobs, limits=LIMITS, command="test", tier="smoke", on_progress=on_progress)
     with Store.open(folder) as store:
         return {name: store.frame(name) for name in ("tasks", "scores", "series")}
 
@@ -181,7 +181,7 @@ def test_results_of_another_seed_or_limit_are_not_mixed_in(tmp_path: Path) -> No
         run(tmp_path, quick_plan(["qce"], seed=5), seed=5)
     with pytest.raises(IncomparableResults, match=r"timeout_s: stored 100.0, now 1"):
         measure(
-            tmp_path, quick_plan(["qce"]), seed=0, jobs=1, limits=Limits(timeout_s=1.0), command="test",
+            tmp_path, quick_plan(["qce"]), seed=0, jobs=1, limits=Limits(timeout_s=1.0), command="test", tier="smoke",
             on_progress=lambda progress: None,
         )  # fmt: skip
 
