@@ -516,19 +516,21 @@ def _tables_only(store: Store, folder: Path) -> list[Path]:
 
 
 def _tables_and_figures(store: Store, folder: Path) -> list[Path]:
+    from harness.environment import available_cores
     from reports.figures import write_figures
 
-    return [*_tables_only(store, folder), *write_figures(store, folder, progress=_say)]
+    return [*_tables_only(store, folder), *write_figures(store, folder, jobs=available_cores(), progress=_say)]
 
 
 def _tables_and_what_can_be_drawn(store: Store, folder: Path) -> list[Path]:
     """As `_tables_and_figures`, for results that may be too few for any figure: the card is written all the same."""
+    from harness.environment import available_cores
     from reports.figures import write_figures
     from reports.scorecard import ReportError
 
     tables = _tables_only(store, folder)
     try:
-        return [*tables, *write_figures(store, folder, progress=_say)]
+        return [*tables, *write_figures(store, folder, jobs=available_cores(), progress=_say)]
     except ReportError as error:
         _say(f"no figures: {error}")
         return tables

@@ -15,9 +15,12 @@ from __future__ import annotations
 
 import io
 import math
+import multiprocessing
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -109,13 +112,18 @@ class _Skipped(Exception):
 
 
 def write_figures(
-    store: Frames, folder: str | os.PathLike[str], *, progress: Callable[[str], None] | None = None
+    store: Frames,
+    folder: str | os.PathLike[str],
+    *,
+    jobs: int = 1,
+    progress: Callable[[str], None] | None = None,
 ) -> list[Path]:
     """Draw every figure that the store has rows for.
 
     Args:
         store: anything with `frame(name)` for "tasks", "scores" and "series".
         folder: where to; made where it is missing.
+        jobs: figures at a time, each in a process of its own; the files are the same for any number.
         progress: told what was drawn, and what was skipped and why.
 
     Returns:
@@ -132,21 +140,39 @@ def write_figures(
     path = prepare(folder)
     written: list[Path] = []
     skipped: list[str] = []
-    for name, draw in FIGURES.items():
-        try:
-            with mpl.rc_context(STYLE):
-                figure = draw(results)
-                written += _save(figure, path, name)
-        except _Skipped as reason:
+    for name, (files, reason) in zip(FIGURES, _draw_all(results, path, jobs), strict=True):
+        written += files
+        if reason:
             skipped.append(f"{name}: {reason}")
-            say(f"skipped {name}: {reason}")
-            continue
-        except ResultsError as error:
-            raise ReportError(f"{name}: {error}") from error
-        say(f"drew {name}")
+        say(f"skipped {name}: {reason}" if reason else f"drew {name}")
     if not written:
         raise ReportError("the store has rows for no figure: " + "; ".join(skipped))
     return written
+
+
+def _draw_all(results: Results, folder: Path, jobs: int) -> Iterator[tuple[list[Path], str]]:
+    """Files of each figure, in order, or the reason why there are none."""
+    draw = partial(_draw, results, folder)
+    if jobs == 1:
+        yield from map(draw, FIGURES)
+        return
+    with ProcessPoolExecutor(min(jobs, len(FIGURES)), multiprocessing.get_context("spawn")) as pool:
+        yield from pool.map(draw, FIGURES)
+
+
+def _draw(results: Results, folder: Path, name: str) -> tuple[list[Path], str]:
+    """Draw and write one figure; its files, or none and the reason.
+
+    Raises:
+        ReportError: the rows are damaged, or the folder cannot be written to.
+    """
+    try:
+        with mpl.rc_context(STYLE):
+            return _save(FIGURES[name](results), folder, name), ""
+    except _Skipped as reason:
+        return [], str(reason)
+    except ResultsError as error:
+        raise ReportError(f"{name}: {error}") from error
 
 
 def _silent(text: str) -> None:

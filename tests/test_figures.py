@@ -40,7 +40,7 @@ def full_store() -> HandmadeStore:
 @pytest.fixture(scope="module")
 def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("figures")
-    written = write_figures(full_store(), folder)
+    written = write_figures(full_store(), folder, jobs=2)
     assert written == [folder / f"{name}.{kind}" for name in FIGURES for kind in ("pdf", "svg", "png")]
     return folder
 
@@ -73,7 +73,9 @@ def test_bitmaps_have_the_resolution_of_print(drawn: Path) -> None:
         assert width >= LEAST_RESOLUTION * ONE_COLUMN
 
 
-def test_the_same_rows_give_the_same_bytes(drawn: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_same_rows_give_the_same_bytes_for_any_number_of_jobs(
+    drawn: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     some = ("fig04_three_ball_chain", "energy_error")
     monkeypatch.setattr(figures, "FIGURES", {name: FIGURES[name] for name in some})
     # Another style beforehand must not show: every figure sets its own.
