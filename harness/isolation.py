@@ -73,6 +73,7 @@ def run_isolated(
     limits: Limits,
     on_end: Callable[[PlannedTask, Ending], None],
     on_poll: Callable[[Sequence[PlannedTask]], None],
+    measure: Callable[[Task], Measurement] | None = None,
 ) -> None:
     """Run tasks in child processes, `jobs` at a time.
 
@@ -82,6 +83,7 @@ def run_isolated(
         limits: of each task.
         on_end: called in this process as soon as a task has ended.
         on_poll: called a few times a second with the tasks in hand.
+        measure: what a worker does with a task, a function of some module; None: `measure_task`.
 
     Raises:
         IsolationError: workers keep dying without any task in hand.
@@ -91,7 +93,7 @@ def run_isolated(
     while waiting:
         before = len(waiting)
         with _pool(jobs) as pool:
-            _drain(pool, waiting, jobs, limits, on_end, on_poll)
+            _drain(pool, waiting, jobs, limits, on_end, on_poll, measure or measure_task)
         restarts = 0 if len(waiting) < before else restarts + 1
         if waiting and restarts >= MOST_RESTARTS:
             raise IsolationError(
@@ -120,6 +122,7 @@ def _drain(
     limits: Limits,
     on_end: Callable[[PlannedTask, Ending], None],
     on_poll: Callable[[Sequence[PlannedTask]], None],
+    measure: Callable[[Task], Measurement],
 ) -> None:
     """Feed one pool until all is done or the pool broke; what it broke on goes back to `waiting`."""
     given: dict[Future[Ending], PlannedTask] = {}
@@ -128,7 +131,7 @@ def _drain(
         # One task more than workers, so that none waits for the parent, and an interrupt has little to undo.
         while waiting and len(given) <= jobs:
             try:
-                future = pool.schedule(_run_task, args=[waiting[0].task, limits], timeout=limits.timeout_s)
+                future = pool.schedule(_run_task, args=[waiting[0].task, limits, measure], timeout=limits.timeout_s)
             except RuntimeError:
                 waiting.extendleft(reversed(given.values()))
                 return
@@ -238,7 +241,7 @@ def _die_with_parent() -> None:
         fcntl.fcntl(parent.sentinel, fcntl.F_SETFL, flags | os.O_ASYNC)
 
 
-def _run_task(task: Task, limits: Limits) -> Ending:
+def _run_task(task: Task, limits: Limits, measure: Callable[[Task], Measurement]) -> Ending:
     """Run one task in this worker; the isolation boundary: here and nowhere else every exception is caught."""
     signal.setitimer(signal.ITIMER_REAL, limits.timeout_s + ALARM_GRACE_S)
     _limit_memory(limits.memory_mb)
@@ -246,7 +249,7 @@ def _run_task(task: Task, limits: Limits) -> Ending:
     begin = time.perf_counter()
     measurement, outcome, reason = None, Outcome.MEASURED, ""
     try:
-        measurement = measure_task(task)
+        measurement = measure(task)
     except UnsupportedProblem as error:
         outcome, reason = Outcome.REFUSED, str(error)
     except InvalidSolution as error:

@@ -168,7 +168,7 @@ def _draw(results: Results, folder: Path, name: str) -> tuple[list[Path], str]:
     """
     try:
         with mpl.rc_context(STYLE):
-            return _save(FIGURES[name](results), folder, name), ""
+            return save(FIGURES[name](results), folder, name), ""
     except _Skipped as reason:
         return [], str(reason)
     except ResultsError as error:
@@ -179,7 +179,7 @@ def _silent(text: str) -> None:
     """Tell nobody."""
 
 
-def _save(figure: Figure, folder: Path, name: str) -> list[Path]:
+def save(figure: Figure, folder: Path, name: str) -> list[Path]:
     """Write one figure in three formats, without dates."""
     FigureCanvasAgg(figure)
     # The layout is the same in every format and costs as much as the drawing: it is done once.
@@ -200,7 +200,7 @@ def _save(figure: Figure, folder: Path, name: str) -> list[Path]:
     return written
 
 
-def _marker(look: Look) -> Mapping[str, Any]:
+def marker_of(look: Look) -> Mapping[str, Any]:
     """Marker settings of a law: hollow or filled, edge in its color."""
     return {
         "marker": look.marker,
@@ -221,7 +221,7 @@ def _law_handles(solvers: Sequence[str], *, lines: bool) -> list[Line2D]:
     return [
         Line2D(
             [], [], color=LOOKS[name].color, linestyle=LOOKS[name].line if lines else "none", label=LOOKS[name].label,
-            **_marker(LOOKS[name]),
+            **marker_of(LOOKS[name]),
         )
         for name in LOOKS
         if name in solvers
@@ -266,11 +266,11 @@ def _curve(panel: Axes, look: Look, va: Floats, y: Floats, *, place: float) -> N
     start = 1 if alone else 0
     every = max(1, va.size // 8)
     panel.plot(
-        va[start:], y[start:], color=look.color, linestyle=look.line, **_marker(look),
+        va[start:], y[start:], color=look.color, linestyle=look.line, **marker_of(look),
         markevery=(int(place * every), every), clip_on=False, zorder=3,
     )  # fmt: skip
     if alone:
-        panel.plot(va[0], y[0], linestyle="none", **_marker(look), clip_on=False, zorder=3)
+        panel.plot(va[0], y[0], linestyle="none", **marker_of(look), clip_on=False, zorder=3)
 
 
 def _sweeps(results: Results) -> Mapping[str, ThreeBallSweep]:
@@ -343,7 +343,7 @@ def _velocity_strips(panel: Axes, rows: Mapping[str, DisturbedCradle], balls: in
             v = row.v_post[:, ball]
             spread = np.linspace(-0.32, 0.32, v.size) if v.size > 1 else np.zeros(v.size)
             panel.plot(
-                center + pitch * spread, v, color=look.color, linestyle="none", **{**_marker(look), "markersize": 2.0,
+                center + pitch * spread, v, color=look.color, linestyle="none", **{**marker_of(look), "markersize": 2.0,
                 "markeredgewidth": 0.5}, zorder=3,
             )  # fmt: skip
             panel.hlines(row.undisturbed[ball], center - pitch / 2, center + pitch / 2, color=BLACK, lw=0.9, zorder=4)
@@ -369,7 +369,7 @@ def _response_curves(panel: Axes, rows: Mapping[str, Sequence[DisturbedCradle]])
         look = LOOKS[name]
         panel.plot(
             [row.size for row in found], [max(row.response, SMALLEST_RESPONSE) for row in found], color=look.color,
-            linestyle=look.line, **_marker(look),
+            linestyle=look.line, **marker_of(look),
         )  # fmt: skip
     panel.set_xscale("log")
     panel.set_yscale("log")
@@ -419,7 +419,7 @@ def _cradle_panel(panel: Axes, rows: Mapping[str, Cradle], balls: int) -> None:
     pitch = 0.8 / len(rows)
     for k, (name, row) in enumerate(rows.items()):
         offset = (k - (len(rows) - 1) / 2) * pitch
-        panel.plot(places + offset, row.v_post, linestyle="none", **_marker(LOOKS[name]), zorder=3)
+        panel.plot(places + offset, row.v_post, linestyle="none", **marker_of(LOOKS[name]), zorder=3)
     panel.set_xticks(places)
     panel.set_xlabel("ball")
     panel.grid(visible=False, axis="x")
@@ -476,7 +476,7 @@ def _error_over_balls(panel: Axes, chains: Mapping[str, Sequence[Cradle]], refer
             _rms([float(np.linalg.norm(row.v_post - _truth(row, reference))) for row in rows if row.balls == n])
             for n in lengths
         ]
-        panel.plot(lengths, errors, color=look.color, linestyle=look.line, **_marker(look), clip_on=False, zorder=3)
+        panel.plot(lengths, errors, color=look.color, linestyle=look.line, **marker_of(look), clip_on=False, zorder=3)
     for rows in list(chains.values())[:1]:
         apart = [
             _rms([float(np.linalg.norm(row.ideal - row.hertz)) for row in rows if row.balls == n]) for n in lengths
