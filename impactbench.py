@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
     from harness.measure import measure_impact, measure_sweep
     from harness.measurement import Measurement, Score, Verdict
+    from harness.revision import TimeComparison
     from harness.run import Progress, Summary
     from harness.selection import SolverChoice
     from harness.store import PlannedTask, Store
@@ -223,6 +224,105 @@ def run(out: Path, **options: Any) -> None:
     sys.exit(EXIT_FAILED_TASKS if failures else 0)
 
 
+@main.command(epilog=EXIT_CODES)
+@click.option("--tier", default="default", show_default=True, help="How much is measured: smoke, default or full.")
+@click.option(
+    "--scenario",
+    "scenarios",
+    multiple=True,
+    metavar="NAME[:KEY=VALUE,…]",
+    help="Only this family or member. Repeatable.",
+)
+@click.option(
+    "--solver",
+    "solvers",
+    multiple=True,
+    metavar="NAME[:KEY=VALUE,…]",
+    help="Only this solver; one named with its accuracy setting is not swept. Repeatable. Default: all.",
+)
+@click.option("--sizes", default="", metavar="N,N,…", help="Spheres of the scaling packs. Default: those of the tier.")
+@click.option("--repeats", type=int, default=None, metavar="N", help="Rounds of timing. Default: those of the tier.")
+@click.option(
+    "--jobs",
+    type=click.IntRange(min=1),
+    default=1,
+    show_default=True,
+    metavar="N",
+    help="Error runs at a time; times are always taken one at a time.",
+)
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of the sphere packs.")
+@click.option(
+    "--timeout",
+    "timeout_s",
+    type=click.FloatRange(min=0, min_open=True),
+    default=120,
+    show_default=True,
+    metavar="SECONDS",
+    help="Time that one task may take; then its process is killed.",
+)
+@click.option(
+    "--memory",
+    "memory_mb",
+    type=click.FloatRange(min=1),
+    default=8192,
+    show_default=True,
+    metavar="MIB",
+    help="Memory that one task may allocate.",
+)
+@click.option("--fresh", is_flag=True, help="Set earlier results aside (renamed, not deleted) and start anew.")
+@click.option(
+    "--out",
+    type=click.Path(file_okay=False, path_type=Path),
+    default=Path("bench"),
+    show_default=True,
+    help="Results folder of its own: a scorecard's is refused.",
+)
+def bench(
+    out: Path, tier: str, scenarios: tuple[str, ...], solvers: tuple[str, ...], sizes: str, repeats: int | None,
+    jobs: int, seed: int, timeout_s: float, memory_mb: float, fresh: bool,
+) -> None:  # fmt: skip
+    """Measure speed against error, growth with size, and first solves; then write bench.md, CSV and figures.
+
+    An interrupted bench goes on where it stopped when the same command is given again.
+
+    \b
+    Examples:
+      impactbench bench --tier smoke
+      impactbench bench --solver qce --solver gr --scenario sphere-pack --sizes 300,1000,4000
+      impactbench bench --solver my_law.py:MyLaw --scenario three-ball-chain:va=0.5
+    """  # noqa: D301
+    with _explained_errors():
+        from harness.isolation import Limits
+        from harness.work_precision import choose_bench, plan_bench, run_bench
+        from reports.bench import write_bench
+
+        try:
+            wanted = [int(size) for size in sizes.split(",") if size.strip()]
+        except ValueError:
+            raise BadInput(f"--sizes must be whole numbers with commas between, not {sizes!r}") from None
+        chosen, families = choose_bench(solvers, scenarios)
+        plan = plan_bench(chosen, tier=tier, scenarios=families, sizes=wanted, repeats=repeats, seed=seed)
+        if fresh:
+            _set_aside(out)
+        click.echo(f"{len(plan)} tasks; results go to {out / 'results.sqlite'}", err=True)
+        try:
+            with _terminated_as_interrupted(), _progress_display() as display:
+                summary = run_bench(
+                    out, plan, seed=seed, jobs=jobs, limits=Limits(timeout_s, memory_mb), command=_command_line(),
+                    on_progress=display,
+                )  # fmt: skip
+        except KeyboardInterrupt:
+            click.echo(f"\ninterrupted; the same command goes on:\n  {_command_line(without='--fresh')}", err=True)
+            sys.exit(EXIT_INTERRUPTED)
+        _print_summary(out, summary)
+        with _open(out) as store:
+            written = write_bench(store, out)
+        click.echo(
+            f"written to {out}: " + ", ".join(path.name for path in written if path.suffix in (".md", ".csv", ".png"))
+        )
+    sys.exit(EXIT_FAILED_TASKS if summary.lost else 0)
+
+
 @main.command()
 @_out_option
 def figures(out: Path) -> None:
@@ -351,11 +451,166 @@ def replay(solver: str, scenario: str, seed: int) -> None:
             raise click.ClickException(f"{solver} refuses {scene.label}: {error}") from error
 
 
+GATE_EXIT_CODES = """
+\b
+Exit codes:
+  0    nothing got worse
+  1    a number got worse by more than its allowance, or a solver × scene of the baseline has no answer any more
+  2    bad usage or input: no such file, another schema version, tier or seed, an unknown metric, unusable results
+  130  interrupted; the same command goes on where it stopped
+"""
+
+
+def _gate_options(command: Command) -> Command:
+    """Options of the gate: with what is compared, and how it is measured."""
+    for option in (
+        click.option("--fresh", is_flag=True, help="Set earlier results aside (renamed, not deleted) and start anew."),
+        click.option(
+            "--memory", "memory_mb", type=click.FloatRange(min=1), default=4096, show_default=True, metavar="MIB",
+            help="Memory that one task may allocate.",
+        ),
+        click.option(
+            "--timeout", "timeout_s", type=click.FloatRange(min=0, min_open=True), default=120, show_default=True,
+            metavar="SECONDS", help="Time that one task may take; then its process is killed.",
+        ),
+        click.option(
+            "--jobs", type=click.IntRange(min=1), default=None, metavar="N",
+            help="Tasks at a time. Default: the number of cores.",
+        ),
+        click.option("--no-measure", is_flag=True, help="Take OUT as it is; nothing is measured."),
+        click.option(
+            "--out", type=click.Path(file_okay=False, path_type=Path), default=Path("results/check"),
+            show_default=True, help="Results folder; what it lacks is measured into it.",
+        ),
+        click.option(
+            "--solver", "solvers", multiple=True, metavar="NAME[:KEY=VALUE,…]",
+            help="Only this solver: a name, or path.py:Class for your own. Repeatable. Default: those of FILE.",
+        ),
+        click.option("--tier", default=None, help="Set of scenes. Default: that of FILE; a first one is of smoke."),
+        click.option(
+            "--baseline", type=click.Path(dir_okay=False, path_type=Path), default=Path("baselines/smoke.json"),
+            show_default=True, metavar="FILE", help="File of accepted numbers.",
+        ),
+    ):  # fmt: skip
+        command = option(command)
+    return command
+
+
+@main.command(epilog=GATE_EXIT_CODES)
+@_gate_options
+@click.option("--against", metavar="REVISION", help="Time every solve against this commit too, in turns, in this job.")
+@click.option("--report", type=click.Path(dir_okay=False, path_type=Path), help="Write the tables as Markdown too.")
+def check(
+    baseline: Path, tier: str | None, solvers: tuple[str, ...], out: Path, against: str | None, report: Path | None,
+    **options: Any,
+) -> None:  # fmt: skip
+    """Compare energy error, momentum, one-sidedness, residuals and counted work with an accepted baseline.
+
+    One-sided, on a logarithm with a floor of 8 eps m: what is rounding may vary, and an error that grew from 2e-9 to
+    1e-8 fails. Wall time is compared with another commit only (--against), which is timed in turns with this tree.
+
+    \b
+    Examples:
+      impactbench check --baseline baselines/smoke.json
+      impactbench check --against origin/main --solver qce
+      impactbench check --solver my_law.py:MyLaw --baseline my_baseline.json --report check.md
+    """  # noqa: D301
+    with _explained_errors():
+        from harness import baseline as gate
+        from reports.gate import gate_markdown, render_gate, render_times
+
+        accepted = gate.read_baseline(baseline)
+        gate.check_same_run(accepted, tier=tier or accepted.tier, seed=accepted.seed)
+        plan = gate.plan_gate(tier=accepted.tier, seed=accepted.seed, solvers=solvers or accepted.solvers)
+        chosen = sorted({planned.task.solver for planned in plan}) if solvers else None
+        gate.gated_entries(accepted, chosen)
+        _measure_gate(out, plan, tier=accepted.tier, seed=accepted.seed, **options)
+        with _open(out) as store:
+            environment = gate.latest_environment(store)
+            comparison = gate.compare(
+                accepted, gate.collect(store, plan), environment=environment, solvers=chosen
+            )  # fmt: skip
+        times = _time_against(against, plan, options["timeout_s"]) if against else None
+        if times:
+            render_times(times, _console())
+        render_gate(comparison, _console())
+        if report is not None:
+            _write_text(report, gate_markdown(comparison, times))
+    sys.exit(EXIT_FAILED_TASKS if comparison.failures or (times and times.slower) else 0)
+
+
+@main.command(epilog=GATE_EXIT_CODES)
+@_gate_options
+@click.option("--reason", required=True, help="Why the new numbers are right; it is kept in the file.")
+@click.option("--seed", type=click.IntRange(min=0), default=None, help="Base of all seeds. Default: FILE's own, or 0.")
+def accept(
+    baseline: Path, tier: str | None, seed: int | None, solvers: tuple[str, ...], out: Path, reason: str, **options: Any
+) -> None:
+    """Accept results as the baseline; what changed by how much is printed, and kept in FILE with the reason.
+
+    With --solver only that solver's numbers are replaced. FILE is written whole or not at all.
+
+    \b
+    Examples:
+      impactbench accept --reason "QCE sums the work anew after every end"
+      impactbench accept --solver my_law.py:MyLaw --baseline my_baseline.json --reason "first baseline"
+    """  # noqa: D301
+    with _explained_errors():
+        from harness import baseline as gate
+        from reports.gate import render_gate
+
+        reason = gate.checked_reason(reason)
+        old = gate.read_baseline(baseline) if baseline.exists() else None
+        tier = tier or (old.tier if old else "smoke")
+        seed = seed if seed is not None else old.seed if old else 0
+        if old:
+            gate.check_same_run(old, tier=tier, seed=seed)
+        plan = gate.plan_gate(tier=tier, seed=seed, solvers=solvers or (old.solvers if old else None))
+        chosen = sorted({planned.task.solver for planned in plan}) if solvers else None
+        _measure_gate(out, plan, tier=tier, seed=seed, **options)
+        with _open(out) as store:
+            environment = gate.latest_environment(store)
+            measured = gate.collect(store, plan)
+        new = gate.accept(
+            measured, old, plan=plan, tier=tier, seed=seed, solvers=chosen, environment=environment, reason=reason
+        )
+        if old:
+            render_gate(gate.compare(old, new.entries, environment=environment), _console())
+        gate.write_baseline(baseline, new)
+    click.echo(f"written: {baseline}: {len(new.entries)} solvers × scenes", err=True)
+
+
+def _measure_gate(out: Path, plan: list[PlannedTask], *, no_measure: bool, fresh: bool, **options: Any) -> None:
+    """Measure what the gate compares, as far as OUT lacks it; who lost a task is in the table."""
+    if no_measure and fresh:
+        raise BadInput("--fresh would leave nothing to compare with --no-measure")
+    if not no_measure:
+        _measure_plan(out, plan, fresh=fresh, **options)
+
+
+def _time_against(revision: str, plan: list[PlannedTask], timeout_s: float) -> TimeComparison:
+    from harness.revision import time_against
+
+    return time_against(revision, plan, timeout_s=timeout_s, on_progress=_say)
+
+
 def _measure(
     out: Path,
     *,
     solvers: tuple[str, ...],
     scenarios: tuple[str, ...],
+    tier: str,
+    seed: int,
+    **options: Any,
+) -> int:
+    """Plan and measure; returns the number of tasks without an answer."""
+    return _measure_plan(out, _plan(solvers, scenarios, tier, seed), tier=tier, seed=seed, **options)
+
+
+def _measure_plan(
+    out: Path,
+    plan: list[PlannedTask],
+    *,
     tier: str,
     jobs: int | None,
     seed: int,
@@ -363,12 +618,11 @@ def _measure(
     memory_mb: float,
     fresh: bool,
 ) -> int:
-    """Plan and measure; returns the number of tasks without an answer."""
+    """Measure what is not done yet of a plan; returns the number of tasks without an answer."""
     from harness.environment import available_cores
     from harness.isolation import Limits
     from harness.run import measure
 
-    plan = _plan(solvers, scenarios, tier, seed)
     if fresh:
         _set_aside(out)
     workers = jobs or available_cores()
@@ -705,6 +959,7 @@ def _prepare() -> None:
 def _explained_errors() -> Iterator[None]:
     """Turn the errors that a user can do something about into one line and exit code 2."""
     _prepare()
+    from harness.baseline import BaselineError
     from harness.isolation import IsolationError
     from harness.measurement import InvalidSolution
     from harness.results import ResultsError
@@ -713,7 +968,7 @@ def _explained_errors() -> Iterator[None]:
 
     try:
         yield
-    except (StoreError, SelectionError, ResultsError, IsolationError) as error:
+    except (StoreError, SelectionError, ResultsError, IsolationError, BaselineError) as error:
         raise BadInput(str(error)) from error
     except InvalidSolution as error:
         raise click.ClickException(f"invalid answer: {error}") from error

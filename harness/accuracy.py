@@ -171,12 +171,17 @@ def coarser(solver: Solver) -> Solver:
 
 
 OWN_EQUATIONS: dict[str, Callable[[Solver, ImpactProblem, ImpactSolution], Score]] = {
+    "ehi": self_convergence,
     "gauss-seidel": energy,
     "gr": energy,
     "hertz": self_convergence,
     "jacobi": energy,
+    "lcp-apgd": newton_lcp,
+    "lcp-clarabel": newton_lcp,
     "lcp-nnls": newton_lcp,
+    "lcp-osqp": newton_lcp,
     "lcp-pgs": newton_lcp,
+    "lcp-spg": newton_lcp,
     "lzb": self_convergence,
     "qce": energy,
     "qce-defer": energy,

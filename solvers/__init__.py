@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from solvers.explicit_hertz import ExplicitHertz
 from solvers.generalized_reflections import GeneralizedReflections
 from solvers.hertz import Hertz
 from solvers.lcp_qp import NewtonLcpNnls
@@ -14,6 +15,7 @@ from solvers.quadratic_contact_energy import DeferredContactEnergy, QuadraticCon
 from solvers.solution import ImpactSolution, Solver, Status, UnsupportedProblem
 
 SOLVERS: dict[str, type[Solver]] = {
+    "ehi": ExplicitHertz,
     "gauss-seidel": GaussSeidel,
     "gr": GeneralizedReflections,
     "hertz": Hertz,

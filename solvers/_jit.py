@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from typing import ParamSpec, TypeVar, cast
 
 import numba
+
+# Threads of OpenMP that wait for each other by spinning take the cores from one another as soon as other processes
+# are at work: a sweep of a millisecond then takes tens of them. Read when the first thread starts.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
+prange = numba.prange
+"""The range of a loop whose passes may run on any thread, in a `parallel_kernel`; elsewhere it is `range`."""
 
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
@@ -19,3 +27,13 @@ def kernel(function: Callable[Parameters, Result]) -> Callable[Parameters, Resul
     Never `fastmath`: the laws are compared to the last bits, and NaN must stay visible.
     """
     return cast("Callable[Parameters, Result]", numba.njit(cache=True, error_model="numpy", fastmath=False)(function))
+
+
+def parallel_kernel(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
+    """Compile as `kernel` does, and let the loops over `prange` run on several threads.
+
+    The passes of such a loop must write to places of their own (gather, never scatter), and sums must be formed over a
+    fixed number of chunks: then the result is the same, bit for bit, for any number of threads.
+    """
+    compiled = numba.njit(cache=True, error_model="numpy", fastmath=False, parallel=True)(function)
+    return cast("Callable[Parameters, Result]", compiled)

@@ -40,7 +40,10 @@ def test_each_layer_imports_only_itself_and_what_stands_to_its_left(layer: str) 
 
 
 def is_kernel(function: ast.FunctionDef) -> bool:
-    return any(isinstance(decorator, ast.Name) and decorator.id == "kernel" for decorator in function.decorator_list)
+    return any(
+        isinstance(decorator, ast.Name) and decorator.id in ("kernel", "parallel_kernel")
+        for decorator in function.decorator_list
+    )
 
 
 def kernels(tree: ast.Module) -> list[ast.FunctionDef]:
@@ -48,7 +51,7 @@ def kernels(tree: ast.Module) -> list[ast.FunctionDef]:
 
 
 ALL_MODULES = [path for layer in LAYERS for path in modules(layer)]
-BUILTINS = {"range", "len", "min", "max", "abs", "float", "int", "bool"}
+BUILTINS = {"range", "prange", "len", "min", "max", "abs", "float", "int", "bool"}
 
 
 @pytest.mark.parametrize("path", ALL_MODULES, ids=lambda path: str(path.relative_to(ROOT)))
