@@ -131,7 +131,11 @@ def test_the_tangent_map_is_zero_for_coulomb_friction_alone(slip: float, frictio
     assert accuracy.tangent_map(problem, answer) == pytest.approx(residual, abs=ROUNDING)
 
 
-@pytest.mark.parametrize("name", [name for name in accuracy.OWN_EQUATIONS if name in SOLVERS])
+# EHI takes a few large steps by design: its own error is the step's, see the test below.
+SOLVED = [name for name in accuracy.OWN_EQUATIONS if name in SOLVERS and name != "ehi"]
+
+
+@pytest.mark.parametrize("name", SOLVED)
 def test_every_law_but_the_jacobi_control_solves_its_own_equations_on_three_balls(name: str) -> None:
     solver = SOLVERS[name]()
     score = accuracy.OWN_EQUATIONS[name](solver, three_balls, solver.solve(three_balls))
@@ -141,6 +145,15 @@ def test_every_law_but_the_jacobi_control_solves_its_own_equations_on_three_ball
     else:
         assert score.verdict in (Verdict.PASS, Verdict.SHOWN)
         assert score.value <= accuracy.VERIFICATION_TOLERANCE
+
+
+def test_explicit_hertz_impulses_solve_their_own_equations_to_second_order_in_the_step() -> None:
+    def own_error(steps: float) -> float:
+        law = SOLVERS["ehi"](steps_per_contact=steps, gap_memory=0.0)  # type: ignore[call-arg]
+        return accuracy.OWN_EQUATIONS["ehi"](law, three_balls, law.solve(three_balls)).value
+
+    # 16 times the steps: 256 times less error at order 2, 16 at order 1.
+    assert own_error(64.0) > 64.0 * own_error(1024.0) > 0.0
 
 
 def test_qce_s_answer_does_not_solve_the_newton_lcp_nor_the_other_way_round() -> None:
