@@ -140,14 +140,14 @@ def main() -> None:
 def _selection_options(command: Command) -> Command:
     """Options that say what is measured."""
     for option in (
-        click.option("--tier", default="default", show_default=True, help="Set of scenes: smoke, default or full."),
+        click.option("--tier", default="default", show_default=True, help="Scenes: smoke, default, full or hard."),
         click.option(
             "--scenario", "scenarios", multiple=True, metavar="NAME[:KEY=VALUE,…]",
             help="Only this family, member or sweep; patterns as 'pool-*' too. Repeatable.",
         ),
         click.option(
             "--solver", "solvers", multiple=True, metavar="NAME[:KEY=VALUE,…]",
-            help="Only this solver: a name, or path.py:Class for your own. Repeatable. Default: all.",
+            help="Only this solver: a name, or path.py:Class for your own. Repeatable. Default: every law, by one method.",
         ),
     ):  # fmt: skip
         command = option(command)
@@ -652,13 +652,11 @@ def _measure_plan(
 def _plan(solvers: tuple[str, ...], scenarios: tuple[str, ...], tier: str, seed: int) -> list[PlannedTask]:
     """Turn the user's names into tasks."""
     from harness.run import plan_tasks
-    from harness.selection import available_solvers, choose_scenarios, choose_solver
+    from harness.selection import choose_scenarios, choose_solver, judged_solvers
     from harness.sweeps import SWEEPS
 
     # A solver that is named twice takes part once.
-    chosen = {
-        choice.specification: choice for choice in (choose_solver(name) for name in solvers or available_solvers())
-    }
+    chosen = {choice.specification: choice for choice in (choose_solver(name) for name in solvers or judged_solvers())}
     scenes = [choice for name in scenarios for choice in choose_scenarios(name, tuple(SWEEPS))]
     plan = plan_tasks(list(chosen.values()), tier=tier, scenarios=scenes, seed=seed)
     if not plan:
@@ -752,11 +750,15 @@ class _PlainProgress:
 
 def _write_reports(out: Path, write: Callable[[Store, Path], list[Path]]) -> None:
     """Print the scorecard, write the reports, and say what was written."""
+    from reports.hard_cases import hard_table
+    from reports.hard_cases import render_terminal as render_hard_cases
     from reports.tables import render_terminal
     from reports.tables import scorecard as add_up
 
     with _open(out) as store:
-        render_terminal(add_up(store), _console())
+        console = _console()
+        render_terminal(add_up(store), console)
+        render_hard_cases(hard_table(store), console)
         written = write(store, out)
     click.echo(f"\nmeasured rows: {store.path}\nwritten to {out}:")
     for path in written:
@@ -764,9 +766,10 @@ def _write_reports(out: Path, write: Callable[[Store, Path], list[Path]]) -> Non
 
 
 def _tables_only(store: Store, folder: Path) -> list[Path]:
+    from reports.hard_cases import write_hard_cases
     from reports.tables import write_tables
 
-    return list(write_tables(store, folder))
+    return [*write_tables(store, folder), *write_hard_cases(store, folder)]
 
 
 def _tables_and_figures(store: Store, folder: Path) -> list[Path]:

@@ -27,7 +27,7 @@ from harness.environment import describe_environment
 from harness.measurement import Kind, Outcome, Verdict
 from harness.results import Frames, Results, ScoreRow, TaskRow
 from harness.run import plan_tasks
-from harness.selection import available_solvers, build_scenario, choose_solver, unknown
+from harness.selection import judged_solvers, build_scenario, choose_solver, unknown
 from harness.store import PlannedTask
 from scenarios.tiers import TIERS
 from solvers import Status
@@ -187,7 +187,7 @@ def plan_gate(*, tier: str, seed: int, solvers: Sequence[str] | None) -> list[Pl
     """
     choices = {
         choice.specification: choice
-        for choice in (choose_solver(name) for name in (available_solvers() if solvers is None else solvers))
+        for choice in (choose_solver(name) for name in (judged_solvers() if solvers is None else solvers))
     }
     plan = plan_tasks(list(choices.values()), tier=tier, seed=seed)
     return [planned for planned in plan if planned.task.kind.value == IMPACT]

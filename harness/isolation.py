@@ -30,6 +30,7 @@ from typing import Any
 
 import pebble
 
+from harness.hard_cases import measure_hard_case
 from harness.measure import measure_impact, measure_sweep
 from harness.measurement import InvalidSolution, Kind, Measurement, Outcome, Task
 from harness.selection import build_scenario, choose_solver
@@ -112,6 +113,8 @@ def measure_task(task: Task) -> Measurement:
     if task.kind is Kind.SWEEP:
         return measure_sweep(choice.solver, task.scenario, task.parameters, seed=task.seed)
     scenario = build_scenario(task.scenario, task.parameters)
+    if task.kind is Kind.HARD_CASE:
+        return measure_hard_case(choice.solver, scenario)
     return measure_impact(choice.solver, scenario, name=choice.name, seed=task.seed)
 
 

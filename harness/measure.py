@@ -17,6 +17,7 @@ import numpy as np
 
 from harness import accuracy, desiderata, metamorphic, robustness
 from harness.checked import Tally, claim, termination
+from harness.hard_cases import ending_scores
 from harness.measurement import InvalidSolution, Measurement, Score, Series, Verdict, not_applicable, shown, upper_bound
 from harness.sweeps import SWEEPS
 from scenarios.scenario import Reference, Scenario
@@ -126,6 +127,7 @@ def measure_impact(solver: Solver, scenario: Scenario, *, seed: int, name: str |
         *_relations(solve, scenario, solution.v_post, effort, seed),
         *claim(problem, solution),
         *termination(solution, tags=scenario.tags),
+        *ending_scores(scenario, solution),
         *_errors(solve, scenario, solution, registry_name(solver) if name is None else name),
     ]
     if "jammed" in scenario.tags and solution.status is not Status.CONVERGED:

@@ -99,6 +99,8 @@ class Kind(Enum):
     """All scores of one solver on one scenario."""
     SWEEP = "sweep"
     """One solver over a family of scenes: the wave effect on chains, the disturbed cradle."""
+    HARD_CASE = "hard case"
+    """One solve of one scene on which laws break, and what it came to."""
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -144,15 +144,19 @@ class Results:
 
     Args:
         store: where the frames come from.
+        kinds: which tasks; hard cases have a table of their own (`harness.hard_cases`) and must not spoil the card.
 
     Raises:
         ResultsError: a frame lacks a needed column, or a cell of it cannot be read.
     """
 
-    def __init__(self, store: Frames) -> None:
-        self.tasks: tuple[TaskRow, ...] = tuple(_task(record) for record in _records(store, "tasks"))
-        by_id = {task.task: task for task in self.tasks}
-        self.scores: tuple[ScoreRow, ...] = tuple(_score(record, by_id) for record in _records(store, "scores"))
+    def __init__(self, store: Frames, *, kinds: Collection[Kind] = (Kind.IMPACT, Kind.SWEEP)) -> None:
+        tasks = [_task(record) for record in _records(store, "tasks")]
+        by_id = {task.task: task for task in tasks}
+        chosen = {kind.value for kind in kinds}
+        self.tasks: tuple[TaskRow, ...] = tuple(task for task in tasks if task.kind in chosen)
+        scores = (_score(record, by_id) for record in _records(store, "scores"))
+        self.scores: tuple[ScoreRow, ...] = tuple(row for row in scores if row.task.kind in chosen)
         self._series: tuple[SeriesRow, ...] = tuple(
             SeriesRow(
                 int(record["series"]),

@@ -22,7 +22,7 @@ from harness.store import Ending, PlannedTask, Store
 from harness.sweeps import SWEEPS
 from scenarios import CATALOG
 from scenarios.scenario import Scenario
-from scenarios.tiers import TIERS
+from scenarios.tiers import HARD, TIERS
 
 # What makes numbers incomparable, of all that the environment says: code, arithmetic, and the machine for times.
 COMPARED = ("impactbench", "source", "python", "numpy", "scipy", "numba", "cpu")
@@ -61,7 +61,7 @@ class Summary:
 def plan_tasks(
     solvers: Sequence[SolverChoice], *, tier: str, scenarios: Sequence[ScenarioChoice] = (), seed: int = 0
 ) -> list[PlannedTask]:
-    """List every task of a tier: each sweep and each scene with each solver.
+    """List every task of a tier: each sweep and each scene with each solver. The hard cases come without sweeps.
 
     Args:
         solvers: who takes part.
@@ -75,17 +75,18 @@ def plan_tasks(
     """
     if tier not in TIERS:
         raise SelectionError(unknown("tier", tier, TIERS))
+    kind, sweeps = (Kind.HARD_CASE, ()) if tier == HARD else (Kind.IMPACT, tuple(SWEEPS))
     # Sweeps take longest and go first: at the end no core waits for one of them.
     planned = [
         PlannedTask(_task(Kind.SWEEP, solver, name, {}, seed), solver.settings, name)
         for name in SWEEPS
-        if not scenarios or any(choice.name == name for choice in scenarios)
+        if any(choice.name == name for choice in scenarios) or (not scenarios and name in sweeps)
         for solver in solvers
     ]
     for scene in _chosen_scenes(tier, scenarios):
         planned += [
             PlannedTask(
-                _task(Kind.IMPACT, solver, scene.name, scene.parameters, seed), solver.settings, scene.label, scene.tags
+                _task(kind, solver, scene.name, scene.parameters, seed), solver.settings, scene.label, scene.tags
             )
             for solver in solvers
         ]

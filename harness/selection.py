@@ -33,7 +33,7 @@ from typing import Any
 
 from scenarios import CATALOG
 from scenarios.scenario import Scenario
-from solvers import SOLVERS, Solver
+from solvers import PEERS, SOLVERS, Solver
 
 ENTRY_POINT_GROUP = "impactbench.solvers"
 # difflib's default of 0.6 misses "pgs" for "lcp-pgs".
@@ -76,6 +76,15 @@ def available_solvers() -> dict[str, type[Solver]]:
     """
     foreign = {name: _load_entry_point(entry) for name, entry in _entry_points().items()}
     return {**SOLVERS, **foreign}
+
+
+def judged_solvers() -> dict[str, type[Solver]]:
+    """The solvers that a scorecard is about where none is named: all but further methods for a law that is there.
+
+    Raises:
+        SelectionError: a package's entry point cannot be loaded.
+    """
+    return {name: law for name, law in available_solvers().items() if name not in PEERS}
 
 
 def choose_solver(specification: str) -> SolverChoice:

@@ -1,6 +1,6 @@
 """Which instances of the catalog a run tries: "smoke" in seconds, "default" for the scorecard, "full" without hurry.
 
-Each tier stands alone; "full" holds all of "default".
+"hard" is what laws break on. Each tier stands alone; "full" holds all of "default".
 """
 
 from __future__ import annotations
@@ -126,7 +126,92 @@ _MORE: tuple[Instance, ...] = (
     ("sphere-pack", {"start": "hot", "restitution": 0.3, "friction": 0.2}),
 )
 
+HARD = "hard"
+"""Tier of the hard cases: one solve each, and what it came to."""
+
+HARD_CASES: dict[str, tuple[Instance, ...]] = {
+    "mass ratios to 1e12": (
+        ("mass-ratio-chain", {"mass_ratio": 1e6}),
+        ("mass-ratio-chain", {"mass_ratio": 1e12}),
+        ("mass-ratio-chain", {"mass_ratio": 1e12, "variant": "geometric"}),
+        ("heavy-and-light", {"mass_ratio": 1e4}),
+        ("heavy-and-light", {"mass_ratio": 1e12}),
+        ("heavy-and-light", {"mass_ratio": 1e12, "arrangement": "alternating"}),
+        ("heavy-and-light", {"mass_ratio": 1e12, "arrangement": "light-striker"}),
+    ),
+    "long chains": (
+        ("long-chain", {"balls": 1000}),
+        ("long-chain", {"balls": 1000, "start": "converging"}),
+        ("long-chain", {"balls": 1000, "restitution": 0.0}),
+        ("long-chain", {"balls": 100_000}),
+        ("long-chain", {"balls": 10_000, "start": "converging"}),
+        ("long-chain", {"balls": 100_000, "restitution": 0.0}),
+    ),
+    "W without full rank": (
+        ("box-on-floor", {"points": 4, "spin": [0.3, 0.2, 0.0]}),
+        ("box-on-floor", {"points": 100, "spin": [0.3, 0.2, 0.0]}),
+        ("box-on-floor", {"points": 100, "copies": 2, "spin": [0.3, 0.2, 0.0], "restitution": 0.5}),
+        ("box-on-floor", {"points": 1000, "spin": [0.3, 0.2, 0.0]}),
+        ("box-on-floor", {"points": 1000, "spin": [0.3, 0.2, 0.0], "restitution": 0.5, "friction": 0.3}),
+    ),
+    "squeezed from all sides": (
+        *_each("ball-between-walls", "balls", (1, 3, 10)),
+        ("ball-between-walls", {"balls": 3, "restitution": 0.5}),
+        ("ball-ring", {"balls": 8}),
+        ("ball-ring", {"balls": 8, "start": "all"}),
+        ("ball-ring", {"balls": 24, "restitution": 0.5}),
+        ("jammed-box", {"rows": 3}),
+        ("jammed-box", {"rows": 3, "start": "all"}),
+        ("jammed-box", {"rows": 8, "columns": 8}),
+        ("jammed-box", {"rows": 8, "columns": 8, "restitution": 0.5}),
+        ("jammed-box", {"rows": 8, "columns": 8, "restitution": 0.0}),
+    ),
+    "disturbances from 1e-16 to 1e-1": (
+        ("three-ball-chain", {"va": 1e-16}),
+        ("three-ball-chain", {"va": 1e-8}),
+        *_each("disturbed-cradle", "size", (1e-16, 1e-13, 1e-10, 1e-7, 1e-4, 1e-2, 1e-1), balls=5),
+    ),
+    "normals nearly parallel or opposed": (
+        ("ball-in-wedge", {"angle": 1e-3}),
+        ("ball-in-wedge", {"angle": 1e-8}),
+        ("ball-in-wedge", {"angle": 1e-6, "planes": 10}),
+        ("ball-in-wedge", {"angle": 1e-6, "planes": 10, "restitution": 0.5}),
+        ("ball-in-wedge", {"angle": 1e-2, "normals": "opposed"}),
+        ("ball-in-wedge", {"angle": 1e-4, "normals": "opposed"}),
+    ),
+    "no contact approaches, or there is none": (
+        ("long-chain", {"balls": 100, "start": "separating"}),
+        ("long-chain", {"balls": 100, "start": "together"}),
+        ("long-chain", {"balls": 1}),
+    ),
+    "restitution 0, 1 and between, by contact": (
+        ("three-ball-chain", {"va": 0.5, "restitution": 0.0}),
+        ("three-ball-chain", {"va": 0.5, "restitution": 1e-6}),
+        ("three-ball-chain", {"va": 0.5, "restitution": 0.5}),
+        *_each("mixed-restitution", "scene", ("struck", "converging", "column", "triangle")),
+    ),
+    "stacks at rest": (
+        *_each("resting-stack", "restitution", (0.0, 0.5), height=10),
+        ("resting-stack", {"height": 10}),
+        *_each("resting-stack", "restitution", (0.0, 0.5), height=6, shape="pyramid"),
+        ("resting-stack", {"height": 6, "shape": "pyramid"}),
+    ),
+    "inelastic collapse": (
+        ("inelastic-collapse", {"balls": 3}),
+        ("inelastic-collapse", {"balls": 3, "restitution": 0.0}),
+        ("inelastic-collapse", {"balls": 20, "restitution": 0.5}),
+    ),
+}
+"""What is hard → its instances, with the parameters in the form in which `Scenario.parameters` has them."""
+
+_HARD = tuple(instance for instances in HARD_CASES.values() for instance in instances)
+
 _DEFAULT = (*_CHAINS, *_BILLIARDS, *_BOXES, *_JAMMED, *_PACKS)
 
-TIERS: dict[str, tuple[Instance, ...]] = {"smoke": _SMOKE, "default": _DEFAULT, "full": (*_DEFAULT, *_MORE)}
+TIERS: dict[str, tuple[Instance, ...]] = {
+    "smoke": _SMOKE,
+    "default": _DEFAULT,
+    "full": (*_DEFAULT, *_MORE),
+    HARD: _HARD,
+}
 """Tier → (family, parameters) of each instance."""

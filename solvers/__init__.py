@@ -5,7 +5,8 @@ from __future__ import annotations
 from solvers.explicit_hertz import ExplicitHertz
 from solvers.generalized_reflections import GeneralizedReflections
 from solvers.hertz import Hertz
-from solvers.lcp_qp import NewtonLcpNnls
+from solvers.lcp_gradient import AcceleratedProjectedGradient, SpectralProjectedGradient
+from solvers.lcp_qp import NewtonLcpClarabel, NewtonLcpNnls, NewtonLcpOsqp
 from solvers.liu_zhao_brogliato import LiuZhaoBrogliato
 from solvers.newton_lcp import NewtonLcp
 from solvers.pairwise import GaussSeidel, Jacobi
@@ -20,8 +21,12 @@ SOLVERS: dict[str, type[Solver]] = {
     "gr": GeneralizedReflections,
     "hertz": Hertz,
     "jacobi": Jacobi,
+    "lcp-apgd": AcceleratedProjectedGradient,
+    "lcp-clarabel": NewtonLcpClarabel,
     "lcp-nnls": NewtonLcpNnls,
+    "lcp-osqp": NewtonLcpOsqp,
     "lcp-pgs": NewtonLcp,
+    "lcp-spg": SpectralProjectedGradient,
     "lzb": LiuZhaoBrogliato,
     "qce": QuadraticContactEnergy,
     "qce-blend": QceBlend,
@@ -30,6 +35,9 @@ SOLVERS: dict[str, type[Solver]] = {
 }
 """Name → law. Adding one is one file and one line here."""
 
+PEERS = frozenset({"lcp-apgd", "lcp-clarabel", "lcp-osqp", "lcp-spg"})
+"""Further methods for the law of `lcp-pgs` and `lcp-nnls`: the bench compares them, the scorecard judges the law once."""
+
 __all__ = [
-    "SOLVERS", "ImpactProblem", "ImpactSolution", "ProblemError", "Solver", "Status", "UnsupportedProblem",
+    "PEERS", "SOLVERS", "ImpactProblem", "ImpactSolution", "ProblemError", "Solver", "Status", "UnsupportedProblem",
 ]  # fmt: skip

@@ -11,11 +11,11 @@ tightly than the tolerance on u: on packs the result is off by 10 % otherwise.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from solvers import boxed_lcp
+from solvers import boxed_lcp, recovery
 from solvers.problem import ImpactProblem
 from solvers.solution import Floats, ImpactSolution, Status, UnsupportedProblem
 
@@ -36,6 +36,9 @@ class GeneralizedReflections:
     max_inner_sweeps: int = 20_000
     """Bound on the sweeps of one inelastic LCP, and of the friction solve."""
 
+    recover_after: int = 0
+    """Reflections after which what still approaches is resolved inelastically; 0 = never (the published law)."""
+
     def solve(self, problem: ImpactProblem) -> ImpactSolution:
         """Solve one multi-impact.
 
@@ -43,7 +46,13 @@ class GeneralizedReflections:
             UnsupportedProblem: the contacts have different restitution.
         """
         restitution = one_restitution(problem, "generalized reflections take")
-        impulse, status, iterations, visits = self._reflect(problem)
+        if self.recover_after:
+            return recovery.resolve(
+                problem, replace(self, recover_after=0, max_iterations=self.recover_after).solve(problem)
+            )
+        impulse, status, iterations, visits = np.zeros(problem.m), Status.CONVERGED, 0, 0
+        if restitution > 0.0:
+            impulse, status, iterations, visits = self._reflect(problem)
         if restitution < 1.0:
             plastic = boxed_lcp.project(
                 problem, np.zeros(problem.m), tolerance=self.inner_tolerance, max_sweeps=self.max_inner_sweeps

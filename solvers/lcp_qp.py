@@ -1,4 +1,4 @@
-"""The Newton LCP solved exactly as a quadratic program: the accuracy peer of projected Gauss-Seidel.
+"""The Newton LCP as a quadratic program: accuracy peers of projected Gauss-Seidel, by other people's methods.
 
     min ½ |x|²  subject to  A x >= (-(1 + c_r) u_pre),   A = J L,  M⁻¹ = L Lᵀ,  v_post = v_pre + L x
 
@@ -6,17 +6,27 @@ Least distance programming: one nonnegative least-squares problem min |E z - f|,
 whose residual gives x and λ = z / (1 + bᵀz). Unlike the dual form it needs no right-hand side in the range of A, so
 that restitution may differ from contact to contact. Source: Lawson and Hanson 1974, "Solving least squares problems",
 chapter 23. Impulses are not unique where W is singular; velocities are.
+
+`lcp-osqp` (Stellato 2020, operator splitting with polishing) and `lcp-clarabel` (Goulart and Chen 2024, interior
+point) get the same program sparse, with a unit diagonal of W and velocities near one; where M⁻¹ is not diagonal, its
+dual min ½ zᵀ W z + bᵀ z, z ≥ 0. Their flags are not read: an interior point method at a tolerance of 1e-6 leaves a
+natural map of 1e-4, and polishing may fail silently. The residual is measured here and decides the status.
 """
 
 from __future__ import annotations
 
+import importlib
+from collections.abc import Callable
 from dataclasses import dataclass
+from types import ModuleType
 
 import numpy as np
 import scipy.linalg
 import scipy.optimize
+import scipy.sparse as sp
 
-from solvers.problem import ImpactProblem
+from solvers.lcp_gradient import judged
+from solvers.problem import ImpactProblem, Matrix
 from solvers.solution import Floats, ImpactSolution, Status, UnsupportedProblem
 
 
@@ -63,6 +73,110 @@ class NewtonLcpNnls:
         pushing = int(np.count_nonzero(impulse))
         # An active set changes one contact at a time: at least one product with all rows for every pushing one.
         return ImpactSolution(impulse, problem.v_after(impulse), status, pushing, problem.m * max(pushing, 1), residual)
+
+
+@dataclass(frozen=True)
+class NewtonLcpOsqp:
+    """Newton LCP by OSQP: operator splitting, then one polish on the contacts that it found pushing; no friction."""
+
+    tolerance: float = 1e-8
+    """Natural-map residual up to which the answer counts as converged, relative to the largest |u_pre|."""
+
+    solver_tolerance: float = 1e-9
+    """OSQP's own absolute and relative tolerance; dimensionless."""
+
+    max_iterations: int = 20_000
+    """Bound on OSQP's iterations."""
+
+    def solve(self, problem: ImpactProblem) -> ImpactSolution:
+        """Solve one multi-impact with any restitution per contact.
+
+        Raises:
+            UnsupportedProblem: friction, or the package osqp is not installed.
+        """
+        return _by_package(problem, "osqp", self._minimize, self.tolerance)
+
+    def _minimize(self, osqp: ModuleType, P: Matrix, q: Floats, A: Matrix, b: Floats) -> tuple[Floats, Floats, int]:
+        """Minimize ½ xᵀPx + qᵀx subject to A x ≥ -b; x, multipliers ≥ 0, iterations."""
+        method = osqp.OSQP()
+        method.setup(
+            sp.csc_matrix(sp.triu(P)), q, sp.csc_matrix(A), -b, np.full(b.size, np.inf),
+            verbose=False, eps_abs=self.solver_tolerance, eps_rel=self.solver_tolerance,
+            max_iter=self.max_iterations,
+        )  # fmt: skip
+        result = method.solve(raise_error=False)
+        iterations = int(result.info.iter)
+        # Polishing without an active constraint would write to the terminal, and has nothing to do.
+        if iterations < self.max_iterations and (A @ result.x + b < -result.y).any():
+            method.update_settings(polishing=True, max_iter=self.max_iterations - iterations)
+            result = method.solve(raise_error=False)
+            iterations += int(result.info.iter)
+        return np.asarray(result.x, np.float64), -np.asarray(result.y, np.float64), iterations
+
+
+@dataclass(frozen=True)
+class NewtonLcpClarabel:
+    """Newton LCP by Clarabel's interior point method; no friction."""
+
+    tolerance: float = 1e-8
+    """Natural-map residual up to which the answer counts as converged, relative to the largest |u_pre|."""
+
+    solver_tolerance: float = 1e-11
+    """Clarabel's own tolerance on gap and feasibility; dimensionless."""
+
+    max_iterations: int = 200
+    """Bound on interior point iterations, each with one factorization."""
+
+    def solve(self, problem: ImpactProblem) -> ImpactSolution:
+        """Solve one multi-impact with any restitution per contact.
+
+        Raises:
+            UnsupportedProblem: friction, or the package clarabel is not installed.
+        """
+        return _by_package(problem, "clarabel", self._minimize, self.tolerance)
+
+    def _minimize(self, clarabel: ModuleType, P: Matrix, q: Floats, A: Matrix, b: Floats) -> tuple[Floats, Floats, int]:
+        """Minimize ½ xᵀPx + qᵀx subject to A x ≥ -b; x, multipliers ≥ 0, iterations."""
+        settings = clarabel.DefaultSettings()
+        settings.verbose = False
+        settings.max_iter = self.max_iterations
+        settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = self.solver_tolerance
+        # One thread: factorizations in parallel would not give the same bits each time.
+        settings.max_threads = 1
+        method = clarabel.DefaultSolver(
+            sp.csc_matrix(sp.triu(P)), q, sp.csc_matrix(-A), b, [clarabel.NonnegativeConeT(b.size)], settings
+        )
+        result = method.solve()
+        return np.asarray(result.x, np.float64), np.asarray(result.z, np.float64), int(result.iterations)
+
+
+def _by_package(
+    problem: ImpactProblem,
+    package: str,
+    minimize: Callable[[ModuleType, Matrix, Floats, Matrix, Floats], tuple[Floats, Floats, int]],
+    tolerance: float,
+) -> ImpactSolution:
+    """Scale a problem, hand it to a package's method, and judge the impulse that comes back."""
+    if problem.has_friction:
+        raise UnsupportedProblem("the quadratic program has no friction: friction must be 0")
+    try:
+        module = importlib.import_module(package)
+    except ImportError:
+        raise UnsupportedProblem(f"the package {package} is not installed: pip install {package}") from None
+    scale = 1.0 / np.sqrt(problem.W_diagonal)
+    b = (1.0 + problem.restitution) * problem.u_pre * scale
+    size = float(-b.min(initial=0.0))
+    if size == 0.0:
+        return judged(problem, np.zeros(problem.m), tolerance, 0, 0)
+    diagonal = problem.inverse_mass.diagonal()
+    if problem.inverse_mass.nnz == np.count_nonzero(diagonal):
+        A = sp.diags_array(scale) @ problem.J @ sp.diags_array(np.sqrt(diagonal))
+        _, z, iterations = minimize(module, sp.eye_array(problem.n), np.zeros(problem.n), A, b / size)
+    else:
+        W = sp.diags_array(scale) @ problem.W @ sp.diags_array(scale)
+        z, _, iterations = minimize(module, W, b / size, sp.eye_array(problem.m), np.zeros(problem.m))
+    impulse = np.maximum(np.nan_to_num(z, posinf=0.0, neginf=0.0), 0.0) * size * scale
+    return judged(problem, impulse, tolerance, iterations, problem.m * iterations)
 
 
 def _unit_rows(problem: ImpactProblem) -> Floats:

@@ -12,24 +12,32 @@ line 33 tests the relative velocities. The equation is kept as e + v t + ½ w t�
 A P² + B P + C, and w is summed anew after every end: by subtraction it cancels and up to 18 % of the energy is lost.
 "The larger root" (Section 3.3) is wrong for w < 0; the first upward zero crossing is right for either sign.
 
+Two implementations give the same answer: `qce_heap` for small problems, `qce_stream` for large ones.
+
 paper → here: S → end, J q̇ → u, A → w/2, B → v, C → e (all three divided by F_i, about the last update).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
+from solvers import qce_stream, recovery
 from solvers._jit import kernel
 from solvers.problem import ImpactProblem
+from solvers.qce_heap import solve_by_heap
 from solvers.solution import Floats, ImpactSolution, Status, UnsupportedProblem
+from solvers.sphere_rows import sphere_rows
 
 Ints = npt.NDArray[np.int32]
+Indices = npt.NDArray[np.uint32]
 
-# Ends closer than a few rounding errors are one event: symmetric scenes have them always.
-TIE = 8 * np.finfo(np.float64).eps
+# Up to here the heap is as fast (sphere packs: equal near 300 contacts, the stream twice as fast at 800; measured).
+SMALL = 200
+# An evaluation of `qce_stream` costs the square of a contact's neighbors, the heap's only their number.
+MOST_CONTACTS_OF_A_BODY = 32
 
 
 @dataclass(frozen=True)
@@ -42,9 +50,16 @@ class QuadraticContactEnergy:
     max_iterations: int = 10_000
     """Bound on outer iterations (compression phases)."""
 
+    recover_after: int = 0
+    """Outer iterations after which what still approaches is resolved inelastically; 0 = never (the published law)."""
+
     def solve(self, problem: ImpactProblem) -> ImpactSolution:
         """Solve one multi-impact; restitution and friction must be 1 and 0 (see `QceLcp` for others)."""
         require_elastic(problem, "qce")
+        if self.recover_after:
+            return recovery.resolve(
+                problem, replace(self, recover_after=0, max_iterations=self.recover_after).solve(problem)
+            )
         return solve_elastic(problem, defer=0.0, tolerance=self.tolerance, max_iterations=self.max_iterations)
 
 
@@ -84,220 +99,66 @@ def require_elastic(problem: ImpactProblem, law: str) -> None:
 
 
 def solve_elastic(problem: ImpactProblem, *, defer: float, tolerance: float, max_iterations: int) -> ImpactSolution:
-    """Run QCE's outer iteration on a problem, whatever its restitution and friction say."""
-    J, JT, JM, MJT = problem.J, problem.JT, problem.JM, problem.MJT
-    impulse, v, iterations, visits, stalled = _solve(
-        J.indptr, J.indices, J.data,
-        JT.indptr, JT.indices,
-        JM.indptr, JM.indices, JM.data,
-        MJT.indptr, MJT.indices, MJT.data,
-        problem.v_pre, problem.speed * tolerance, defer, max_iterations,
+    """Run QCE's outer iteration on a problem, whatever its restitution and friction say.
+
+    Args:
+        problem: bodies, contacts, velocities.
+        defer: contacts with F_i < defer · max F wait for the next outer iteration; dimensionless.
+        tolerance: a contact approaches when u < -tolerance times the largest |u_pre|; dimensionless.
+        max_iterations: bound on outer iterations.
+    """
+    speed = problem.speed
+    threshold = speed * tolerance
+    impulse, iterations, visits, stalled = _outer_iterations(problem, threshold, defer, max_iterations)
+    J, JM = problem.J, problem.JM
+    v, u_min = _outcome(
+        J.indptr, J.indices.view(np.uint32), J.data, JM.indptr, JM.indices.view(np.uint32), JM.data,
+        problem.v_pre, impulse,
     )  # fmt: skip
-    u_min = float((J @ v).min(initial=0.0))
     if not np.isfinite(v).all():
         status = Status.NOT_FINITE
     elif stalled:
         status = Status.STALLED
-    elif u_min < -tolerance * problem.speed:
+    elif iterations >= max_iterations and u_min < -threshold:
         status = Status.ITERATION_LIMIT
     else:
         status = Status.CONVERGED
-    residual = -u_min / problem.speed if problem.speed > 0 else 0.0
-    return ImpactSolution(impulse, v, status, iterations, visits, residual)
+    return ImpactSolution(impulse, v, status, iterations, visits, max(-u_min, 0.0) / (speed or 1.0))
+
+
+def _outer_iterations(
+    problem: ImpactProblem, threshold: float, defer: float, max_iterations: int
+) -> tuple[Floats, int, int, bool]:
+    """Choose between heap and stream, which give the same; impulse, outer iterations, contact visits, stalled."""
+    if problem.m >= SMALL and np.diff(problem.MJT.indptr).max(initial=0) <= MOST_CONTACTS_OF_A_BODY:
+        rows = sphere_rows(problem)
+        if rows is None:
+            streamed = qce_stream.solve_sparse(problem, threshold=threshold, defer=defer, max_iterations=max_iterations)
+        else:
+            streamed = qce_stream.solve_spheres(rows, threshold=threshold, defer=defer, max_iterations=max_iterations)
+        impulse, iterations, visits, flag = streamed
+        if flag != qce_stream.RESTLESS:
+            if rows is not None:
+                impulse = rows.in_problem_order(impulse)
+            return impulse, iterations, visits, flag == qce_stream.STALLED
+    return solve_by_heap(problem, threshold=threshold, defer=defer, max_iterations=max_iterations)
 
 
 @kernel
-def _first_end(e: float, v: float, w: float) -> float:
-    """First t ≥ 0 at which e + v t + ½ w t² crosses zero upward; inf where it never does."""
-    if v <= 0.0:
-        if w <= 0.0:
-            return np.inf
-        return float((-v + np.sqrt(max(v * v - 2.0 * w * e, 0.0))) / w)
-    discriminant = v * v - 2.0 * w * e
-    if discriminant < 0.0:
-        return np.inf
-    # Rounding may leave e slightly above zero: the contact ends now.
-    return float(max(-2.0 * e / (v + np.sqrt(discriminant)), 0.0))
-
-
-@kernel
-def _sift_up(heap: Ints, place: Ints, end: Floats, start: int) -> None:
-    """Move the contact at heap position `start` up until its parent ends no later."""
-    position = start
-    i = heap[position]
-    while position > 0:
-        parent = (position - 1) >> 1
-        j = heap[parent]
-        if end[j] <= end[i]:
-            break
-        heap[position] = j
-        place[j] = position
-        position = parent
-    heap[position] = i
-    place[i] = position
-
-
-@kernel
-def _sift_down(heap: Ints, place: Ints, end: Floats, start: int, size: int) -> None:
-    """Move the contact at heap position `start` down until its children end no earlier."""
-    position = start
-    i = heap[position]
-    while True:
-        child = 2 * position + 1
-        if child >= size:
-            break
-        if child + 1 < size and end[heap[child + 1]] < end[heap[child]]:
-            child += 1
-        j = heap[child]
-        if end[i] <= end[j]:
-            break
-        heap[position] = j
-        place[j] = position
-        position = child
-    heap[position] = i
-    place[i] = position
-
-
-@kernel
-def _solve(
-    J_start: Ints, J_index: Ints, J: Floats,
-    JT_start: Ints, JT_index: Ints,
-    JM_start: Ints, JM_index: Ints, JM: Floats,
-    MJT_start: Ints, MJT_index: Ints, MJT: Floats,
-    v_pre: Floats, threshold: float, defer: float, max_iterations: int,
-) -> tuple[Floats, Floats, int, int, bool]:  # fmt: skip
-    """Outer iterations on an indexed heap; returns impulse, velocity, iterations, contact visits, stalled."""
-    m = J_start.size - 1
-    n = v_pre.size
-    velocity = v_pre.copy()
-    impulse = np.zeros(m)
-    u = np.zeros(m)
-    F = np.zeros(m)
-    active = np.zeros(m, np.bool_)
-    e = np.zeros(m)
-    v = np.zeros(m)
-    w = np.zeros(m)
-    since = np.zeros(m)
-    end = np.zeros(m)
-    P = np.zeros(m)
-    a = np.zeros(n)
-    heap = np.zeros(m, np.int32)
-    place = np.zeros(m, np.int32)
-    ended = np.zeros(m, np.int32)
-    touched = np.zeros(m, np.int32)
-    contact_mark = np.full(m, -1, np.int64)
-    body_mark = np.full(n, -1, np.int64)
-    event = 0
-    visits = 0
-    iterations = 0
-    while iterations < max_iterations:
-        # What approaches, and how fast.
-        F_max = 0.0
-        for i in range(m):
-            u_i = 0.0
-            for q in range(J_start[i], J_start[i + 1]):
-                u_i += J[q] * velocity[J_index[q]]
-            u[i] = u_i
-            F_max = max(F_max, -u_i)
-        visits += m
-        if not F_max > threshold:
-            break
-        iterations += 1
-        floor = max(threshold, defer * F_max)
-        size = 0
-        for i in range(m):
-            active[i] = -u[i] > threshold and -u[i] >= floor
-            F[i] = -u[i] if active[i] else 0.0
-            P[i] = 0.0
-            if active[i]:
-                heap[size] = i
-                place[i] = size
-                size += 1
-        # Acceleration of every velocity in the clock s, then of every active contact.
-        for d in range(n):
-            a_d = 0.0
-            for q in range(MJT_start[d], MJT_start[d + 1]):
-                a_d += MJT[q] * F[MJT_index[q]]
-            a[d] = a_d
-        for position in range(size):
-            i = heap[position]
-            w_i = 0.0
-            for q in range(J_start[i], J_start[i + 1]):
-                w_i += J[q] * a[J_index[q]]
-            e[i] = 0.0
-            v[i] = u[i]
-            w[i] = w_i
-            since[i] = 0.0
-            end[i] = _first_end(0.0, u[i], w_i)
-        visits += size
-        for position in range(size // 2 - 1, -1, -1):
-            _sift_down(heap, place, end, position, size)
-        # End one contact after the other, earliest first; equal ends are one event.
-        stalled = False
-        while size > 0:
-            s = end[heap[0]]
-            if not s < np.inf:
-                stalled = True
-                break
-            event += 1
-            ended_count = 0
-            while size > 0 and end[heap[0]] <= s + TIE * s:
-                k = heap[0]
-                size -= 1
-                heap[0] = heap[size]
-                place[heap[0]] = 0
-                if size > 0:
-                    _sift_down(heap, place, end, 0, size)
-                P[k] = F[k] * end[k]
-                F[k] = 0.0
-                active[k] = False
-                ended[ended_count] = k
-                ended_count += 1
-            # The velocities that the ended contacts drove: sum their acceleration anew.
-            touched_count = 0
-            for c in range(ended_count):
-                k = ended[c]
-                for p in range(JM_start[k], JM_start[k + 1]):
-                    d = JM_index[p]
-                    if body_mark[d] == event:
-                        continue
-                    body_mark[d] = event
-                    a_d = 0.0
-                    for q in range(MJT_start[d], MJT_start[d + 1]):
-                        a_d += MJT[q] * F[MJT_index[q]]
-                    a[d] = a_d
-                    for q in range(JT_start[d], JT_start[d + 1]):
-                        i = JT_index[q]
-                        if active[i] and contact_mark[i] != event:
-                            contact_mark[i] = event
-                            touched[touched_count] = i
-                            touched_count += 1
-            # Their active contacts: advance to s, take the new slope, find the new end.
-            for c in range(touched_count):
-                i = touched[c]
-                t = s - since[i]
-                e[i] += (v[i] + 0.5 * w[i] * t) * t
-                v[i] += w[i] * t
-                since[i] = s
-                w_i = 0.0
-                for q in range(J_start[i], J_start[i + 1]):
-                    w_i += J[q] * a[J_index[q]]
-                w[i] = w_i
-                before = end[i]
-                end[i] = s + _first_end(e[i], v[i], w_i)
-                if end[i] < before:
-                    _sift_up(heap, place, end, place[i])
-                else:
-                    _sift_down(heap, place, end, place[i], size)
-            visits += touched_count
-        if stalled:
-            # Contacts that never end would leave work behind: this iteration is not applied.
-            return impulse, velocity, iterations, visits, True
-        for d in range(n):
-            dv = 0.0
-            for q in range(MJT_start[d], MJT_start[d + 1]):
-                dv += MJT[q] * P[MJT_index[q]]
-            velocity[d] += dv
-        for i in range(m):
-            impulse[i] += P[i]
-    return impulse, velocity, iterations, visits, False
+def _outcome(
+    J_start: Ints, J_index: Indices, J: Floats, JM_start: Ints, JM_index: Indices, JM: Floats,
+    v_pre: Floats, impulse: Floats,
+) -> tuple[Floats, float]:  # fmt: skip
+    """Velocity after an impulse, and the smallest u, at most 0; in a kernel, as sparse products cost 30 µs a call."""
+    v = v_pre.copy()
+    for i in range(impulse.size):
+        if impulse[i] != 0.0:
+            for q in range(JM_start[i], JM_start[i + 1]):
+                v[JM_index[q]] += JM[q] * impulse[i]
+    u_min = 0.0
+    for i in range(impulse.size):
+        u = 0.0
+        for q in range(J_start[i], J_start[i + 1]):
+            u += J[q] * v[J_index[q]]
+        u_min = min(u_min, u)
+    return v, u_min

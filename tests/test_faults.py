@@ -121,7 +121,9 @@ def measured_by(folder: Path, specifications: list[str], limits: Limits, jobs: i
     plan = plan_tasks(
         [choose_solver(specification) for specification in specifications], tier="smoke", scenarios=[SCENE]
     )
-    measure(folder, plan, seed=0, jobs=jobs, limits=limits, command="test", tier="smoke", on_progress=lambda progress: None)
+    measure(
+        folder, plan, seed=0, jobs=jobs, limits=limits, command="test", tier="smoke", on_progress=lambda _progress: None
+    )  # fmt: skip
     with Store.open(folder) as store:
         return store.frame("results")
 

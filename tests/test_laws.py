@@ -222,7 +222,7 @@ def naive_outer_iteration(W: Floats, u: Floats) -> Floats:
 
     while active.any():
         best, first = np.inf, -1
-        for i in np.flatnonzero(active):
+        for i in np.flatnonzero(active).tolist():
             # Quadratic in s between two ends of others: the smallest root above the last end, by its coefficients.
             last = ends[np.isfinite(ends)].max(initial=0.0)
             e0, e1, e2 = (work(i, last + t) for t in (0.0, 1.0, 2.0))
@@ -246,5 +246,6 @@ def test_qce_equals_brute_force_on_its_integral(seed: int) -> None:
     W, u = root @ root.T, -rng.uniform(0.1, 1.0, m)
     problem = ImpactProblem.from_delassus(W, u)
     first = solve_elastic(problem, defer=0.0, tolerance=1e-10, max_iterations=1)
+    assert first.impulse is not None
     # The oracle finds roots by polynomial coefficients of differences: about 1e-10 of accuracy.
     np.testing.assert_allclose(first.impulse, naive_outer_iteration(W, u), rtol=1e-8)

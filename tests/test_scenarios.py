@@ -93,8 +93,8 @@ def test_labels_are_unique_within_a_tier(tier: str) -> None:
     assert len(set(labels)) == len(labels)
 
 
-def test_the_default_tier_covers_every_family_and_full_covers_default() -> None:
-    assert {name for name, _ in TIERS["default"]} == set(CATALOG)
+def test_the_default_and_the_hard_tier_cover_every_family_and_full_covers_default() -> None:
+    assert {name for name, _ in (*TIERS["default"], *TIERS["hard"])} == set(CATALOG)
     assert all(instance in TIERS["full"] for instance in TIERS["default"])
 
 

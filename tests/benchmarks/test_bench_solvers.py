@@ -1,0 +1,208 @@
+"""Cost of QCE, GR and the LCP methods on dense sphere layers; `pytest -m long tests/benchmarks/test_bench_solvers.py`.
+
+Targets are ratios within one run, as machines and their load differ: an event of QCE (the end of one contact in one
+outer iteration) against a row visit of projected Gauss-Seidel on the same problem, timed in turn on the same thread.
+They are noted in `extra_info` and printed, never asserted; the energy error is.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+
+from scenarios.packs import sphere_pack
+from solvers import ImpactProblem, Status, boxed_lcp, qce_stream
+from solvers.generalized_reflections import GeneralizedReflections
+from solvers.lcp_gradient import AcceleratedProjectedGradient, SpectralProjectedGradient
+from solvers.lcp_qp import NewtonLcpClarabel, NewtonLcpOsqp
+from solvers.newton_lcp import NewtonLcp
+from solvers.qce_heap import solve_by_heap
+from solvers.quadratic_contact_energy import QuadraticContactEnergy
+from solvers.solution import Solver
+from solvers.sphere_rows import sphere_rows
+
+pytestmark = pytest.mark.long
+
+SPHERES = [1000, 4000, 15_000, 60_000]
+ENERGY = 1e-13
+TOLERANCE = 1e-10
+# Interleaved repeats of QCE and Gauss-Seidel; their median ratio is what counts.
+REPEATS = 7
+SWEEPS = 8
+# Peak memory of one solve beyond what the process held with the finished problem; the kernel resets its peak.
+MEMORY = """
+import sys
+from scenarios.packs import sphere_pack
+from solvers.quadratic_contact_energy import QuadraticContactEnergy
+def status(field):
+    with open("/proc/self/status") as lines:
+        return next(int(line.split()[1]) * 1024 for line in lines if line.startswith(field))
+law = QuadraticContactEnergy()
+law.solve(sphere_pack(spheres=4000).problem)
+problem = sphere_pack(spheres=int(sys.argv[1]), start=sys.argv[2]).problem
+problem.u_pre, problem.MJT
+with open("/proc/self/clear_refs", "w") as peak:
+    peak.write("5")
+before = status("VmRSS")
+solution = law.solve(problem)
+sys.stdout.write(str((status("VmHWM") - before) / problem.m))
+"""
+
+
+@cache
+def layer(spheres: int, start: str) -> ImpactProblem:
+    problem = sphere_pack(spheres=spheres, start=start).problem
+    # What every law would share is made before the clock runs.
+    assert problem.W_diagonal.size == problem.u_pre.size == problem.JT.shape[1] == problem.MJT.shape[1]
+    assert problem.DM.shape[0] == 2 * problem.m
+    return problem
+
+
+def seconds(work: Callable[[], object]) -> float:
+    """CPU time of this thread for one call."""
+    start = time.thread_time()
+    work()
+    return time.thread_time() - start
+
+
+@cache
+def events(spheres: int, start: str) -> int:
+    """Contact ends of a whole QCE solution."""
+    problem = layer(spheres, start)
+    rows = sphere_rows(problem)
+    assert rows is not None
+    total = 0
+    while True:
+        # Each call goes on from the velocities that the last one left.
+        impulse, iterations, _, _ = qce_stream.solve_spheres(
+            rows, threshold=TOLERANCE * problem.speed, defer=0.0, max_iterations=1
+        )
+        if iterations == 0:
+            return total
+        total += int(np.count_nonzero(impulse))
+
+
+def energy_error(problem: ImpactProblem, law: Solver) -> float:
+    before = problem.kinetic_energy(problem.v_pre)
+    return problem.kinetic_energy(law.solve(problem).v_post) / before - 1.0
+
+
+@pytest.mark.parametrize("start", ["kick", "hot"])
+@pytest.mark.parametrize("spheres", SPHERES)
+def test_an_event_of_qce_against_a_row_visit(benchmark: Any, spheres: int, start: str) -> None:
+    problem = layer(spheres, start)
+    law = QuadraticContactEnergy(tolerance=TOLERANCE)
+    solution = benchmark.pedantic(law.solve, args=(problem,), rounds=3, warmup_rounds=1)
+    assert solution.status is Status.CONVERGED
+    ends = events(spheres, start)
+    event = np.empty(REPEATS)
+    visit = np.empty(REPEATS)
+    for repeat in range(REPEATS):
+        event[repeat] = seconds(lambda: law.solve(problem)) / ends
+        visit[repeat] = seconds(lambda: boxed_lcp.sweep(problem, -problem.u_pre, tolerance=0.0, max_sweeps=SWEEPS)) / (
+            problem.m * (SWEEPS + 1)
+        )
+    error = energy_error(problem, law)
+    memory = subprocess.run(
+        [sys.executable, "-c", MEMORY, str(spheres), start], check=True, capture_output=True, text=True
+    ).stdout
+    benchmark.extra_info.update(
+        contacts=problem.m,
+        events=ends,
+        iterations=solution.iterations,
+        ms=float(event.min() * ends * 1e3),
+        ns_per_event=float(event.min() * 1e9),
+        ns_per_row_visit=float(visit.min() * 1e9),
+        ratio=float(np.median(event / visit)),
+        energy_error=error,
+        bytes_per_contact=float(memory),
+    )
+    print(f"\nqce {start} {benchmark.extra_info}")
+    assert abs(error) <= ENERGY
+
+
+@pytest.mark.parametrize("start", ["kick", "hot"])
+def test_the_exponent_of_time_over_contacts(benchmark: Any, start: str) -> None:
+    law = QuadraticContactEnergy(tolerance=TOLERANCE)
+    contacts = np.array([layer(spheres, start).m for spheres in SPHERES], dtype=float)
+    times = np.full((REPEATS, len(SPHERES)), np.inf)
+    for repeat in range(REPEATS):
+        for column, spheres in enumerate(SPHERES):
+            problem = layer(spheres, start)
+            times[repeat, column] = seconds(lambda problem=problem: law.solve(problem))  # type: ignore[misc]
+    slopes = np.polyfit(np.log(contacts), np.log(times.T), 1)[0]
+    benchmark.pedantic(law.solve, args=(layer(SPHERES[0], start),), rounds=1)
+    benchmark.extra_info.update(
+        exponent_of_minimum=float(np.polyfit(np.log(contacts), np.log(times.min(axis=0)), 1)[0]),
+        exponent_median=float(np.median(slopes)),
+        ms=[float(x) for x in 1e3 * times.min(axis=0)],
+    )
+    print(f"\nexponent {start} {benchmark.extra_info}")
+
+
+@pytest.mark.parametrize("start", ["kick", "hot"])
+@pytest.mark.parametrize("spheres", SPHERES)
+def test_the_heap_beside_the_stream(benchmark: Any, spheres: int, start: str) -> None:
+    problem = layer(spheres, start)
+    threshold = TOLERANCE * problem.speed
+    benchmark.pedantic(
+        lambda: solve_by_heap(problem, threshold=threshold, defer=0.0, max_iterations=10_000),
+        rounds=3,
+        warmup_rounds=1,
+    )
+    benchmark.extra_info.update(contacts=problem.m)
+
+
+@pytest.mark.parametrize("start", ["kick", "hot"])
+@pytest.mark.parametrize("spheres", SPHERES)
+@pytest.mark.parametrize("inner_tolerance", [1e-4, 1e-9, 1e-13])
+def test_generalized_reflections(benchmark: Any, spheres: int, start: str, inner_tolerance: float) -> None:
+    problem = layer(spheres, start)
+    law = GeneralizedReflections(inner_tolerance=inner_tolerance)
+    solution = benchmark.pedantic(law.solve, args=(problem,), rounds=1)
+    benchmark.extra_info.update(
+        contacts=problem.m,
+        iterations=solution.iterations,
+        visits=solution.visits,
+        status=str(solution.status),
+        ms=1e3 * benchmark.stats.stats.min,
+    )
+    print(f"\ngr {start} {inner_tolerance} {benchmark.extra_info}")
+
+
+METHODS: dict[str, Callable[[float], Solver]] = {
+    "lcp-pgs": lambda tolerance: NewtonLcp(tolerance=tolerance, max_iterations=2000),
+    "lcp-apgd": lambda tolerance: AcceleratedProjectedGradient(tolerance=tolerance, max_iterations=4000),
+    "lcp-spg": lambda tolerance: SpectralProjectedGradient(tolerance=tolerance, max_iterations=4000),
+    "lcp-osqp": lambda tolerance: NewtonLcpOsqp(tolerance=tolerance),
+    "lcp-clarabel": lambda tolerance: NewtonLcpClarabel(tolerance=tolerance),
+}
+# A factorization of 4,000 spheres takes tens of seconds.
+FACTORIZED_SPHERES = 1000
+
+
+@pytest.mark.parametrize("start", ["kick", "hot"])
+@pytest.mark.parametrize("spheres", SPHERES)
+@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize("tolerance", [1e-3, 1e-6, 1e-9])
+def test_time_to_a_residual(benchmark: Any, name: str, spheres: int, start: str, tolerance: float) -> None:
+    if name in ("lcp-osqp", "lcp-clarabel") and spheres > FACTORIZED_SPHERES:
+        pytest.skip("a factorization of this size takes minutes")
+    problem = layer(spheres, start)
+    solution = benchmark.pedantic(METHODS[name](tolerance).solve, args=(problem,), rounds=1)
+    benchmark.extra_info.update(
+        contacts=problem.m,
+        iterations=solution.iterations,
+        visits=solution.visits,
+        residual=solution.residual,
+        reached=bool(solution.residual <= tolerance),
+        ms=1e3 * benchmark.stats.stats.min,
+    )
+    print(f"\n{name} {start} {tolerance} {benchmark.extra_info}")

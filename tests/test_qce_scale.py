@@ -1,0 +1,255 @@
+"""QCE at scale: the streamed fixed point gives what the heap gives, in any order, and conserves energy."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from scenarios.billiards import pool_break
+from scenarios.packs import sphere_pack
+from solvers import SOLVERS, ImpactProblem, Status, qce_stream
+from solvers.qce_heap import solve_by_heap
+from solvers.quadratic_contact_energy import MOST_CONTACTS_OF_A_BODY, SMALL, solve_elastic
+from solvers.solution import Floats
+from solvers.sphere_rows import RENUMBERED, sphere_rows
+from tests.random_problems import KINDS, make, problems, reordered
+
+# Both evaluate the same equations; their rounding grows over tens to thousands of outer iterations.
+SAME_ANSWER = 1e-11
+# The law returns each contact's energy; only rounding may remain.
+ENERGY = 1e-13
+TOLERANCE = 1e-10
+
+Streamed = Callable[..., tuple[Floats, int, int, int]]
+
+
+def by_sparse_rows(problem: ImpactProblem, **settings: float) -> tuple[Floats, int, int, int]:
+    return qce_stream.solve_sparse(problem, **settings)  # type: ignore[arg-type]
+
+
+def by_sphere_rows(problem: ImpactProblem, **settings: float) -> tuple[Floats, int, int, int]:
+    rows = sphere_rows(problem)
+    assert rows is not None
+    impulse, iterations, visits, flag = qce_stream.solve_spheres(rows, **settings)  # type: ignore[arg-type]
+    return rows.in_problem_order(impulse), iterations, visits, flag
+
+
+def check_against_heap(problem: ImpactProblem, *, defer: float = 0.0, max_iterations: int = 10_000) -> None:
+    """Impulses, outer iterations and the verdict of every streamed form agree with the heap's."""
+    options = {"threshold": TOLERANCE * problem.speed, "defer": defer, "max_iterations": max_iterations}
+    expected, iterations, _, stalled = solve_by_heap(problem, **options)  # type: ignore[arg-type]
+    forms: list[Streamed] = [by_sparse_rows]
+    if sphere_rows(problem) is not None:
+        forms.append(by_sphere_rows)
+    for form in forms:
+        impulse, count, visits, flag = form(problem, **options)
+        np.testing.assert_allclose(impulse, expected, rtol=0, atol=SAME_ANSWER * expected.max(initial=0.0))
+        assert count == iterations
+        assert visits >= problem.m
+        assert flag == (qce_stream.STALLED if stalled else 0)
+
+
+def energy_error(problem: ImpactProblem, v_post: Floats) -> float:
+    before = problem.kinetic_energy(problem.v_pre)
+    return abs(problem.kinetic_energy(v_post) - before) / before
+
+
+def chain(n: int, v_pre: Floats) -> ImpactProblem:
+    rows = np.arange(n - 1)
+    J = np.zeros((n - 1, n))
+    J[rows, rows] = -1.0
+    J[rows, rows + 1] = 1.0
+    return ImpactProblem(np.ones(n), J, v_pre)
+
+
+def star(arms: int, seed: int) -> ImpactProblem:
+    """A heavy ball in the middle of others that all fly at it: every contact has all others as neighbors."""
+    rng = np.random.default_rng(seed)
+    normals = rng.normal(size=(arms, 3))
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    J = np.zeros((arms, 3 * (arms + 1)))
+    for i, normal in enumerate(normals):
+        J[i, :3] = -normal
+        J[i, 3 * (i + 1) : 3 * (i + 2)] = normal
+    v_pre = np.concatenate([np.zeros(3), (-normals * rng.uniform(0.5, 1.5, (arms, 1))).ravel()])
+    return ImpactProblem(np.concatenate([np.full(3, 0.1), np.ones(3 * arms)]), J, v_pre)
+
+
+# Without numba, infinite ends in a batch warn: inf - inf is NaN there, which no comparison selects.
+@pytest.mark.filterwarnings("ignore:invalid value encountered:RuntimeWarning")
+@pytest.mark.kernels
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_kernel_gives_the_heaps_answer(kind: str) -> None:
+    for seed in range(3):
+        check_against_heap(make(kind, seed), max_iterations=20)
+    check_against_heap(star(26, seed=0), max_iterations=1)
+
+
+@given(problems, st.sampled_from([0.0, 0.1]))
+@settings(deadline=None, max_examples=200)
+def test_the_stream_gives_the_heaps_answer_on_random_problems(problem: ImpactProblem, defer: float) -> None:
+    check_against_heap(problem, defer=defer)
+
+
+@pytest.mark.parametrize("start", ["kick", "hot"])
+@pytest.mark.parametrize("spheres", [100, 1000])
+def test_the_stream_gives_the_heaps_answer_on_packs(start: str, spheres: int) -> None:
+    check_against_heap(sphere_pack(spheres=spheres, start=start).problem)
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(2, 12))
+@settings(deadline=None, max_examples=60)
+def test_the_stream_gives_the_heaps_answer_where_couplings_are_negative_and_dense(seed: int, m: int) -> None:
+    rng = np.random.default_rng(seed)
+    root = rng.normal(size=(m, m + 2))
+    check_against_heap(ImpactProblem.from_delassus(root @ root.T, rng.normal(size=m)), max_iterations=50)
+
+
+@pytest.mark.parametrize("balls", [15, 55])
+def test_ties_of_a_symmetric_rack_end_together(balls: int) -> None:
+    problem = pool_break(balls=balls).problem
+    check_against_heap(problem)
+    impulse = by_sparse_rows(problem, threshold=TOLERANCE * problem.speed, defer=0.0, max_iterations=10_000)[0]
+    order = np.random.default_rng(0).permutation(problem.m)
+    shuffled = by_sparse_rows(
+        reordered(problem, order), threshold=TOLERANCE * problem.speed, defer=0.0, max_iterations=10_000
+    )[0]
+    np.testing.assert_allclose(shuffled, impulse[order], rtol=0, atol=SAME_ANSWER * impulse.max())
+
+
+@pytest.mark.parametrize(("balls", "moving"), [(20, 1), (20, 7), (300, 2)])
+def test_cradles_agree_with_the_heap(balls: int, moving: int) -> None:
+    check_against_heap(chain(balls, np.concatenate([np.ones(moving), np.zeros(balls - moving)])))
+
+
+def test_a_long_chain_is_searched_around_what_moved_alone() -> None:
+    # One ball flies into 2,000: each outer iteration moves the pulse by one, and must not look at all contacts.
+    balls = 2001
+    v_pre = np.zeros(balls)
+    v_pre[0] = 1.0
+    problem = chain(balls, v_pre)
+    solution = SOLVERS["qce"]().solve(problem)
+    assert solution.status is Status.CONVERGED
+    assert solution.v_post[-1] == pytest.approx(1.0, abs=1e-12)
+    assert solution.iterations == balls - 1
+    assert solution.visits < 20 * balls
+
+
+@pytest.mark.parametrize("arms", [20, 30, 60])
+def test_contacts_with_many_neighbors_are_evaluated_alone(arms: int) -> None:
+    assert (arms > qce_stream.MOST_NEIGHBORS) == (arms != 20)
+    check_against_heap(star(arms, seed=arms))
+
+
+def test_bodies_with_very_many_contacts_are_left_to_the_heap(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise AssertionError
+
+    monkeypatch.setattr(qce_stream, "solve_spheres", refuse)
+    problem = star(SMALL + 1, seed=0)
+    assert problem.m > MOST_CONTACTS_OF_A_BODY
+    solution = solve_elastic(problem, defer=0.0, tolerance=TOLERANCE, max_iterations=10_000)
+    assert energy_error(problem, solution.v_post) < ENERGY
+
+
+def test_a_restless_fixed_point_falls_back_on_the_heap(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem = sphere_pack(spheres=200).problem
+    expected = solve_elastic(problem, defer=0.0, tolerance=TOLERANCE, max_iterations=10_000)
+    restless = (np.zeros(problem.m), 1, 1, qce_stream.RESTLESS)
+    monkeypatch.setattr(qce_stream, "solve_spheres", lambda *_, **__: restless)
+    solution = solve_elastic(problem, defer=0.0, tolerance=TOLERANCE, max_iterations=10_000)
+    np.testing.assert_allclose(solution.v_post, expected.v_post, atol=SAME_ANSWER * problem.speed)
+    assert solution.status is Status.CONVERGED
+
+
+def test_stalls_and_bounds_are_reported_alike() -> None:
+    closing = ImpactProblem([1.0, 0.0, 0.0], [[1.0, -1.0, 0.0], [-1.0, 0.0, 1.0]], [0.0, 1.0, -1.0])
+    check_against_heap(closing)
+    between_walls = ImpactProblem([1.0], [[1.0], [-1.0]], [-1.0])
+    check_against_heap(between_walls, max_iterations=101)
+    pack = sphere_pack(spheres=200).problem
+    solution = solve_elastic(pack, defer=0.0, tolerance=TOLERANCE, max_iterations=5)
+    assert solution.status is Status.ITERATION_LIMIT
+    assert solution.iterations == 5
+
+
+@pytest.mark.parametrize("start", ["kick", "hot", "patch"])
+def test_packs_conserve_energy_to_rounding(start: str) -> None:
+    problem = sphere_pack(spheres=1000, start=start).problem
+    solution = SOLVERS["qce"]().solve(problem)
+    assert solution.status is Status.CONVERGED
+    assert energy_error(problem, solution.v_post) < ENERGY
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("start", ["kick", "hot"])
+@pytest.mark.parametrize("spheres", [4000, 15_000, 60_000])
+def test_large_packs_conserve_energy_to_rounding(start: str, spheres: int) -> None:
+    problem = sphere_pack(spheres=spheres, start=start).problem
+    solution = SOLVERS["qce"]().solve(problem)
+    assert solution.status is Status.CONVERGED
+    assert energy_error(problem, solution.v_post) < ENERGY
+    check_against_heap(problem)
+
+
+def test_the_same_problem_gives_the_same_bits() -> None:
+    problem = sphere_pack(spheres=1000, start="hot").problem
+    first, second = (SOLVERS["qce"]().solve(problem) for _ in range(2))
+    np.testing.assert_array_equal(first.v_post, second.v_post)
+    assert (first.iterations, first.visits) == (second.iterations, second.visits)
+
+
+def test_packs_do_not_depend_on_the_order_of_contacts() -> None:
+    problem = sphere_pack(spheres=1000, start="hot").problem
+    order = np.random.default_rng(1).permutation(problem.m)
+    solution = SOLVERS["qce"]().solve(problem)
+    shuffled = SOLVERS["qce"]().solve(reordered(problem, order))
+    np.testing.assert_allclose(shuffled.v_post, solution.v_post, atol=SAME_ANSWER * problem.speed)
+
+
+@pytest.mark.parametrize("kind", ["chain", "discs", "spheres"])
+def test_spheres_discs_and_beads_are_recognized(kind: str) -> None:
+    for seed in range(20):
+        problem = make(kind, seed)
+        rows = sphere_rows(problem)
+        assert rows is not None
+        a, b = rows.body[:, 0], rows.body[:, 1]
+        u = np.einsum("ij,ij->i", rows.normal, rows.V[b, :3] - rows.V[a, :3])
+        np.testing.assert_allclose(rows.in_problem_order(u), problem.u_pre, atol=1e-14 * problem.speed)
+
+
+def test_other_rows_are_not_taken_for_spheres() -> None:
+    dense = make("random Jacobian", 0)
+    levers = ImpactProblem(np.ones(4), [[-1.0, 0.0, 2.0, 0.0]], np.ones(4))
+    three_bodies = ImpactProblem(np.ones(9), [[1.0, 0, 0, -1.0, 0, 0, 1.0, 0, 0]], np.ones(9))
+    anisotropic = ImpactProblem([1.0, 2.0, 3.0, 1.0, 2.0, 4.0], [[0.6, 0.8, 0, 0, -0.6, -0.8]], np.ones(6))
+    for problem in (dense, levers, three_bodies, anisotropic):
+        assert sphere_rows(problem) is None
+
+
+def test_renumbering_keeps_every_contact_and_body() -> None:
+    problem = sphere_pack(spheres=3000, start="hot").problem
+    assert problem.m > RENUMBERED
+    rows = sphere_rows(problem)
+    assert rows is not None
+    np.testing.assert_array_equal(np.sort(rows.contact), np.arange(problem.m))
+    assert (rows.contact != np.arange(problem.m)).any()
+    a, b = rows.body[:, 0], rows.body[:, 1]
+    u = np.einsum("ij,ij->i", rows.normal, rows.V[b, :3] - rows.V[a, :3])
+    np.testing.assert_allclose(rows.in_problem_order(u), problem.u_pre, atol=1e-14 * problem.speed)
+
+
+def test_small_problems_use_the_heap(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise AssertionError
+
+    monkeypatch.setattr(qce_stream, "solve_spheres", refuse)
+    monkeypatch.setattr(qce_stream, "solve_sparse", refuse)
+    problem = chain(SMALL, np.linspace(1.0, -1.0, SMALL))
+    assert SOLVERS["qce"]().solve(problem).status is Status.CONVERGED
+    with pytest.raises(AssertionError):
+        SOLVERS["qce"]().solve(chain(SMALL + 1, np.linspace(1.0, -1.0, SMALL + 1)))
