@@ -147,7 +147,7 @@ def _selection_options(command: Command) -> Command:
         ),
         click.option(
             "--solver", "solvers", multiple=True, metavar="NAME[:KEY=VALUE,…]",
-            help="Only this solver: a name, or path.py:Class for your own. Repeatable. Default: every law, by one method.",
+            help="Only this solver: a name, or path.py:Class for yours. Repeatable. Default: every law, by one method.",
         ),
     ):  # fmt: skip
         command = option(command)

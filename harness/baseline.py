@@ -27,7 +27,7 @@ from harness.environment import describe_environment
 from harness.measurement import Kind, Outcome, Verdict
 from harness.results import Frames, Results, ScoreRow, TaskRow
 from harness.run import plan_tasks
-from harness.selection import judged_solvers, build_scenario, choose_solver, unknown
+from harness.selection import build_scenario, choose_solver, judged_solvers, unknown
 from harness.store import PlannedTask
 from scenarios.tiers import TIERS
 from solvers import Status

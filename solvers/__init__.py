@@ -36,7 +36,7 @@ SOLVERS: dict[str, type[Solver]] = {
 """Name → law. Adding one is one file and one line here."""
 
 PEERS = frozenset({"lcp-apgd", "lcp-clarabel", "lcp-osqp", "lcp-spg"})
-"""Further methods for the law of `lcp-pgs` and `lcp-nnls`: the bench compares them, the scorecard judges the law once."""
+"""More methods for the law of `lcp-pgs` and `lcp-nnls`: the bench compares them, the scorecard judges the law once."""
 
 __all__ = [
     "PEERS", "SOLVERS", "ImpactProblem", "ImpactSolution", "ProblemError", "Solver", "Status", "UnsupportedProblem",

@@ -58,6 +58,7 @@ class GeneralizedReflections:
                 problem, np.zeros(problem.m), tolerance=self.inner_tolerance, max_sweeps=self.max_inner_sweeps
             )
             impulse = (1.0 - restitution) * plastic.impulse + restitution * impulse
+            iterations += 1
             visits += plastic.visits
             status = _worse(status, plastic.residual, self.tolerance)
         friction_impulse = None

@@ -79,7 +79,7 @@ class NewtonLcpNnls:
 class NewtonLcpOsqp:
     """Newton LCP by OSQP: operator splitting, then one polish on the contacts that it found pushing; no friction."""
 
-    tolerance: float = 1e-8
+    tolerance: float = 1e-10
     """Natural-map residual up to which the answer counts as converged, relative to the largest |u_pre|."""
 
     solver_tolerance: float = 1e-9

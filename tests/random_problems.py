@@ -47,8 +47,10 @@ def random_jacobian(rng: np.random.Generator) -> ImpactProblem:
     J = rng.normal(size=(m, n))
     opening = rng.normal(size=n)
     J *= np.sign(J @ opening)[:, None]
-    root = rng.normal(size=(n, n)) + 2.0 * np.eye(n)
-    return ImpactProblem(root @ root.T, J, rng.normal(size=n))
+    # Principal masses within a factor of ten, in random directions: an energy is then known to rounding.
+    directions, _ = np.linalg.qr(rng.normal(size=(n, n)))
+    inverse_mass = directions @ np.diag(10.0 ** rng.uniform(-0.5, 0.5, n)) @ directions.T
+    return ImpactProblem(0.5 * (inverse_mass + inverse_mass.T), J, rng.normal(size=n))
 
 
 def make(kind: str, seed: int) -> ImpactProblem:
