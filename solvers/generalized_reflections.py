@@ -30,8 +30,8 @@ class GeneralizedReflections:
     inner_tolerance: float = 1e-13
     """Natural-map residual of the inelastic LCP on the violated contacts, relative to the largest |u_pre|."""
 
-    max_iterations: int = 10_000
-    """Bound on reflections."""
+    max_iterations: int = 5_000
+    """Bound on reflections; a light ball under a mass of 10⁶ takes 3,141."""
 
     max_inner_sweeps: int = 20_000
     """Bound on the sweeps of one inelastic LCP, and of the friction solve."""
