@@ -67,15 +67,15 @@ FULL = Effort(8, 1, 3, 4, 1, 2, 32, robustness.SIZES, 6, 2, UNITS, (LARGE, 1 / L
 REDUCED = Effort(2, 1, 1, 1, 1, 1, 2, (1e-12, 1e-8, 1e-4, 1e-1), 1, 1, UNITS, (LARGE,))
 MINIMAL = Effort(1, 0, 1, 1, 1, 1, 1, (1e-8, 1e-2), 1, 0, UNITS, (LARGE,))
 SCANT = Effort(1, 0, 1, 0, 1, 0, 1, (), 0, 0, ("speed",), (LARGE,))
-# A solve that was cut off, or takes a second by itself: only its symmetry is looked at.
+# A solve that was cut off, or is dear by itself: only its symmetry is looked at.
 ONCE = Effort(1, 0, 1, 0, 0, 0, 0, (), 0, 0, (), ())
 # Contacts up to which the effort is full or reduced.
 SMALL, MIDDLE = 60, 500
 # Work of one solve, in contact visits, up to which the effort is full, reduced or minimal: at 10-100 ns a visit the
 # 180, 40 and 15 solves of these then take about a second at most.
 CHEAP, DEAR, DEAREST = 60_000, 600_000, 4_000_000
-# Above this one solve takes about a second.
-ENOUGH = 20_000_000
+# Above this a solve takes a quarter of a second or more, and eight of them would be most of a run's time.
+ENOUGH = 6_000_000
 # One iteration of a law that is composed of kernels in Python costs as much as so many visits.
 VISITS_PER_ITERATION = 500
 

@@ -156,7 +156,8 @@ def _draw_all(results: Results, folder: Path, jobs: int) -> Iterator[tuple[list[
     if jobs == 1:
         yield from map(draw, FIGURES)
         return
-    with ProcessPoolExecutor(min(jobs, len(FIGURES)), multiprocessing.get_context("spawn")) as pool:
+    # After a run the fork server is there, with most libraries loaded.
+    with ProcessPoolExecutor(min(jobs, len(FIGURES)), multiprocessing.get_context("forkserver")) as pool:
         yield from pool.map(draw, FIGURES)
 
 

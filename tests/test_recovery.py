@@ -190,3 +190,23 @@ def test_recovery_is_off_unless_it_is_asked_for() -> None:
     assert approach(problem, plain) == pytest.approx(1.0)
     # Elastic: the ball goes to and fro and keeps its energy; recovered, it stops.
     assert Recovered(QuadraticContactEnergy(max_iterations=25)).solve(problem).v_post == pytest.approx([0.0], abs=1e-12)
+
+
+@every_jammed_scene
+@pytest.mark.parametrize("law", [QuadraticContactEnergy, GeneralizedReflections])
+def test_recovery_is_a_setting_that_ends_jammed_scenes_and_is_off_by_default(
+    law: type[QuadraticContactEnergy] | type[GeneralizedReflections], scene: Scenario
+) -> None:
+    problem = scene.problem
+    assert law().recover_after == 0
+    try:
+        plain = law(max_iterations=25).solve(problem)
+        recovered = law(recover_after=25).solve(problem)
+    except UnsupportedProblem:
+        return
+    assert plain.status is not Status.CONVERGED
+    assert (problem.J @ plain.v_post).min() < -APPROACH * problem.speed
+    # The law did not end, and says so; what approached no longer does, at no gain of energy.
+    assert recovered.status is plain.status
+    assert (problem.J @ recovered.v_post).min() >= -APPROACH * problem.speed
+    assert problem.kinetic_energy(recovered.v_post) <= problem.kinetic_energy(plain.v_post) * (1 + ENERGY_ROUNDING)
