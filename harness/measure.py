@@ -73,9 +73,9 @@ ONCE = Effort(1, 0, 1, 0, 0, 0, 0, (), 0, 0, (), ())
 SMALL, MIDDLE = 60, 500
 # Work of one solve, in contact visits, up to which the effort is full, reduced or minimal: at 10-100 ns a visit the
 # 180, 40 and 15 solves of these then take about a second at most.
-CHEAP, DEAR, DEAREST = 60_000, 600_000, 4_000_000
-# Above this a solve takes a quarter of a second or more, and eight of them would be most of a run's time.
-ENOUGH = 6_000_000
+CHEAP, DEAR, DEAREST = 60_000, 250_000, 1_500_000
+# Above this a solve takes a good tenth of a second, and eight of them would be most of a run's time.
+ENOUGH = 3_000_000
 # One iteration of a law that is composed of kernels in Python costs as much as so many visits.
 VISITS_PER_ITERATION = 500
 
@@ -87,9 +87,9 @@ def effort_for(*, contacts: int, solution: ImpactSolution) -> Effort:
         return FULL
     if contacts <= MIDDLE and work <= DEAR:
         return REDUCED
-    if work <= DEAREST:
-        return MINIMAL
-    return SCANT if solution.status is Status.CONVERGED and work <= ENOUGH else ONCE
+    if solution.status is not Status.CONVERGED or work > ENOUGH:
+        return ONCE
+    return MINIMAL if work <= DEAREST else SCANT
 
 
 def registry_name(solver: Solver) -> str:
