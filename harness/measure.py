@@ -2,7 +2,8 @@
 
 The number of solves depends on counts alone (contacts, visits and iterations of the first solve), never on seconds, so
 that the same task measures the same rows on every machine: about 180 solves on small scenes, 40 on middle ones, 15 on
-large ones, 8 where a solve is dear, 3 where a dear one did not even end. Random variants come from the task's seed.
+large ones, 8 where a solve is dear, 3 where it is dearer still or did not even end. Random variants come from the
+task's seed.
 """
 
 from __future__ import annotations
