@@ -13,8 +13,7 @@ import os
 import shlex
 import signal
 import sys
-import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -22,16 +21,12 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 if TYPE_CHECKING:
-    import pandas as pd
     from rich.console import Console
-    from rich.progress import Progress as ProgressBar
-    from rich.progress import TaskID
 
     from harness.measure import measure_impact, measure_sweep
     from harness.measurement import Measurement, Score, Verdict
     from harness.revision import TimeComparison
-    from harness.run import Progress, Summary
-    from harness.selection import SolverChoice
+    from harness.run import Summary
     from harness.store import PlannedTask, Store
     from scenarios import CATALOG
     from scenarios.scenario import Reference, Scenario
@@ -65,16 +60,12 @@ __all__ = [
 EXIT_FAILED_TASKS = 1
 EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130
-# Where there is no terminal (a log file, CI) a line this often shows that the run is alive [s].
-PLAIN_PROGRESS_S = 5.0
 # Columns of a table that goes to a file or a pipe.
 PLAIN_WIDTH = 120
 # Failures shown one by one at the end; the others are in the report.
 SHOWN_FAILURES = 10
 # Rows that stand behind a claim, as far as they are named.
 SHOWN_ROWS = 4
-# Entries of a vector that `replay` prints.
-SHOWN_ENTRIES = 24
 
 EXIT_CODES = """
 \b
@@ -154,8 +145,8 @@ def _selection_options(command: Command) -> Command:
     return command
 
 
-def _run_options(command: Command) -> Command:
-    """Options that say how it is measured, and where results go."""
+def _limit_options(command: Command) -> Command:
+    """Options that bound a task, and start a run anew."""
     for option in (
         click.option("--fresh", is_flag=True, help="Set earlier results aside (renamed, not deleted) and start anew."),
         click.option(
@@ -166,15 +157,29 @@ def _run_options(command: Command) -> Command:
             "--timeout", "timeout_s", type=click.FloatRange(min=0, min_open=True), default=120, show_default=True,
             metavar="SECONDS", help="Time that one task may take; then its process is killed.",
         ),
-        click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Base of all seeds."),
-        click.option(
-            "--jobs", type=click.IntRange(min=1), default=None, metavar="N",
-            help="Tasks at a time. Default: the number of cores.",
-        ),
-        _out_option,
     ):  # fmt: skip
         command = option(command)
     return command
+
+
+def _jobs_option(command: Command) -> Command:
+    """Tasks at a time."""
+    return click.option(
+        "--jobs", type=click.IntRange(min=1), default=None, metavar="N",
+        help="Tasks at a time. Default: the number of cores.",
+    )(command)  # fmt: skip
+
+
+def _seed_option(command: Command) -> Command:
+    """The seed of a run."""
+    return click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Base of all seeds.")(
+        command
+    )
+
+
+def _run_options(command: Command) -> Command:
+    """Options that say how it is measured, and where results go."""
+    return _limit_options(_seed_option(_jobs_option(_out_option(command))))
 
 
 def _out_option(command: Command) -> Command:
@@ -250,26 +255,8 @@ def run(out: Path, **options: Any) -> None:
     metavar="N",
     help="Error runs at a time; times are always taken one at a time.",
 )
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of the sphere packs.")
-@click.option(
-    "--timeout",
-    "timeout_s",
-    type=click.FloatRange(min=0, min_open=True),
-    default=120,
-    show_default=True,
-    metavar="SECONDS",
-    help="Time that one task may take; then its process is killed.",
-)
-@click.option(
-    "--memory",
-    "memory_mb",
-    type=click.FloatRange(min=1),
-    default=8192,
-    show_default=True,
-    metavar="MIB",
-    help="Memory that one task may allocate.",
-)
-@click.option("--fresh", is_flag=True, help="Set earlier results aside (renamed, not deleted) and start anew.")
+@_seed_option
+@_limit_options
 @click.option(
     "--out",
     type=click.Path(file_okay=False, path_type=Path),
@@ -295,6 +282,7 @@ def bench(
         from harness.isolation import Limits
         from harness.work_precision import choose_bench, plan_bench, run_bench
         from reports.bench import write_bench
+        from reports.progress import progress_display
 
         try:
             wanted = [int(size) for size in sizes.split(",") if size.strip()]
@@ -306,7 +294,7 @@ def bench(
             _set_aside(out)
         click.echo(f"{len(plan)} tasks; results go to {out / 'results.sqlite'}", err=True)
         try:
-            with _terminated_as_interrupted(), _progress_display() as display:
+            with _terminated_as_interrupted(), progress_display() as display:
                 summary = run_bench(
                     out, plan, seed=seed, jobs=jobs, limits=Limits(timeout_s, memory_mb), command=_command_line(),
                     on_progress=display,
@@ -409,12 +397,17 @@ def export(out: Path, table: Any, form: str, to: Path | None) -> None:
       impactbench export --table tasks --format json --to tasks.json
     """  # noqa: D301
     with _explained_errors():
+        from reports.export import as_csv, as_json, write_parquet
+
         with _open(out) as store:
             frame = store.frame(table)
         if form == "parquet":
-            _export_parquet(frame, to)
+            if to is None:
+                raise BadInput("Parquet is no text: name a file with --to")
+            write_parquet(frame, to)
+            _say(f"written: {to}")
             return
-        text = _as_csv(frame) if form == "csv" else _as_json(frame)
+        text = as_csv(frame) if form == "csv" else as_json(frame)
         if to is None:
             click.echo(text, nl=False)
         else:
@@ -424,7 +417,7 @@ def export(out: Path, table: Any, form: str, to: Path | None) -> None:
 @main.command()
 @click.argument("solver")
 @click.argument("scenario")
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Base of all seeds.")
+@_seed_option
 def replay(solver: str, scenario: str, seed: int) -> None:
     """Run SOLVER on SCENARIO here, in this process, and print velocities and all scores.
 
@@ -438,6 +431,7 @@ def replay(solver: str, scenario: str, seed: int) -> None:
     """  # noqa: D301
     with _explained_errors():
         from harness.selection import build_scenario, choose_scenarios, choose_solver
+        from reports.replay import print_replay
         from solvers import UnsupportedProblem
 
         choice = choose_solver(solver)
@@ -446,7 +440,7 @@ def replay(solver: str, scenario: str, seed: int) -> None:
             raise BadInput(f"{scenario} names {len(families)} families; name one")
         scene = build_scenario(families[0].name, families[0].parameters)
         try:
-            _print_replay(choice, scene, seed)
+            print_replay(choice, scene, seed, _console())
         except UnsupportedProblem as error:
             raise click.ClickException(f"{solver} refuses {scene.label}: {error}") from error
 
@@ -464,19 +458,6 @@ Exit codes:
 def _gate_options(command: Command) -> Command:
     """Options of the gate: with what is compared, and how it is measured."""
     for option in (
-        click.option("--fresh", is_flag=True, help="Set earlier results aside (renamed, not deleted) and start anew."),
-        click.option(
-            "--memory", "memory_mb", type=click.FloatRange(min=1), default=4096, show_default=True, metavar="MIB",
-            help="Memory that one task may allocate.",
-        ),
-        click.option(
-            "--timeout", "timeout_s", type=click.FloatRange(min=0, min_open=True), default=120, show_default=True,
-            metavar="SECONDS", help="Time that one task may take; then its process is killed.",
-        ),
-        click.option(
-            "--jobs", type=click.IntRange(min=1), default=None, metavar="N",
-            help="Tasks at a time. Default: the number of cores.",
-        ),
         click.option("--no-measure", is_flag=True, help="Take OUT as it is; nothing is measured."),
         click.option(
             "--out", type=click.Path(file_okay=False, path_type=Path), default=Path("results/check"),
@@ -493,7 +474,7 @@ def _gate_options(command: Command) -> Command:
         ),
     ):  # fmt: skip
         command = option(command)
-    return command
+    return _limit_options(_jobs_option(command))
 
 
 @main.command(epilog=GATE_EXIT_CODES)
@@ -622,6 +603,7 @@ def _measure_plan(
     from harness.environment import available_cores
     from harness.isolation import Limits
     from harness.run import measure
+    from reports.progress import progress_display
 
     if fresh:
         _set_aside(out)
@@ -633,7 +615,7 @@ def _measure_plan(
         err=True,
     )
     try:
-        with _terminated_as_interrupted(), _progress_display() as display:
+        with _terminated_as_interrupted(), progress_display() as display:
             summary = measure(
                 out, plan, seed=seed, jobs=workers, limits=Limits(timeout_s, memory_mb), command=_command_line(),
                 tier=tier, on_progress=display,
@@ -691,61 +673,6 @@ def _terminated_as_interrupted() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGTERM, before)
-
-
-@contextmanager
-def _progress_display() -> Iterator[Callable[[Progress], None]]:
-    """A bar on a terminal, lines elsewhere; both on standard error, so that the card can be piped."""
-    if not sys.stderr.isatty():
-        yield _PlainProgress()
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
-    from rich.progress import Progress as ProgressBar
-
-    columns = (
-        BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("{task.fields[failures]}"),
-        TextColumn("{task.description}", markup=False),
-    )  # fmt: skip
-    with ProgressBar(*columns, console=Console(stderr=True)) as bar:
-        yield _BarProgress(bar)
-
-
-class _BarProgress:
-    """Progress as a bar with the tasks in hand."""
-
-    def __init__(self, bar: ProgressBar) -> None:
-        self._bar = bar
-        self._row: TaskID = bar.add_task("starting", total=None, failures="")
-
-    def __call__(self, progress: Progress) -> None:
-        self._bar.update(self._row, total=progress.total, completed=progress.done)
-        self._bar.update(self._row, failures=f"{progress.failures} failed" if progress.failures else "")
-        if progress.in_hand:
-            self._bar.update(self._row, description=", ".join(progress.in_hand))
-
-
-class _PlainProgress:
-    """Progress as lines: every failure, and one line every few seconds."""
-
-    def __init__(self) -> None:
-        self._last = time.monotonic()
-
-    def __call__(self, progress: Progress) -> None:
-        from harness.run import FAILURES, describe
-
-        if progress.ended and progress.ending and progress.ending.outcome in FAILURES:
-            click.echo(
-                f"{describe(progress.ended)}: {progress.ending.outcome.value}: {progress.ending.reason}", err=True
-            )
-        now = time.monotonic()
-        if now - self._last >= PLAIN_PROGRESS_S and progress.in_hand:
-            self._last = now
-            click.echo(
-                f"{progress.done}/{progress.total} done, {progress.failures} failed, {progress.elapsed_s:.0f} s; "
-                f"in hand: {', '.join(progress.in_hand)}",
-                err=True,
-            )
 
 
 def _write_reports(out: Path, write: Callable[[Store, Path], list[Path]]) -> None:
@@ -838,96 +765,6 @@ def _print_entry(name: str, text: str, detail: str) -> None:
 
 def _first_line(thing: object) -> str:
     return next(iter((thing.__doc__ or "").strip().splitlines()), "")
-
-
-def _print_replay(choice: SolverChoice, scene: Scenario, seed: int) -> None:
-    """Solve, measure, and print what came out."""
-    from rich.table import Table
-
-    from harness.checked import checked_solve
-    from harness.measure import measure_impact
-    from harness.measurement import Kind
-    from harness.run import task_seed
-
-    console = _console()
-    solution = checked_solve(choice.solver, scene.problem)
-    console.print(f"[bold]{choice.specification}[/] on [bold]{scene.label}[/]: {scene.source}", highlight=False)
-    console.print(
-        f"{solution.status.label} after {solution.iterations} iterations, {solution.visits} contact visits. "
-        f"{solution.status.happened}"
-    )
-    u_post = scene.problem.J @ solution.v_post
-    vectors = {"v_pre": scene.problem.v_pre, "v_post": solution.v_post, "u_pre": scene.problem.u_pre, "u_post": u_post}
-    if solution.impulse is not None:
-        vectors["impulse"] = solution.impulse
-    for name, vector in vectors.items():
-        console.print(f"{name:8} {_vector(vector)}", highlight=False)
-    measured = measure_impact(
-        choice.solver, scene, name=choice.name, seed=task_seed(seed, Kind.IMPACT, scene.name, scene.parameters)
-    )
-    table = Table()
-    for heading in ("score", "metric", "value", "tolerance", "verdict", "reference"):
-        table.add_column(heading)
-    for score in measured.scores:
-        table.add_row(
-            score.name,
-            score.metric,
-            f"{score.value:.3g}",
-            f"{score.tolerance:.3g}",
-            score.verdict.value,
-            score.reference,
-        )
-    console.print(table)
-
-
-def _vector(vector: Any) -> str:
-    """A vector as text, its middle left out where it is long."""
-    numbers = [f"{float(value): .10g}" for value in vector]
-    if len(numbers) > SHOWN_ENTRIES:
-        half = SHOWN_ENTRIES // 2
-        numbers = [*numbers[:half], f" … {len(numbers) - 2 * half} more …", *numbers[-half:]]
-    return " ".join(numbers)
-
-
-def _as_csv(frame: pd.DataFrame) -> str:
-    """A table as CSV; structured cells as JSON text."""
-    import json
-
-    flat = frame.map(lambda value: json.dumps(value, ensure_ascii=False) if isinstance(value, (dict, list)) else value)
-    return str(flat.to_csv(index=False, lineterminator="\n"))
-
-
-def _as_json(frame: pd.DataFrame) -> str:
-    """A table as a list of records, in JSON that every reader takes."""
-    import json
-
-    records = [{key: _strict(value) for key, value in record.items()} for record in frame.to_dict("records")]
-    return json.dumps(records, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
-
-
-def _strict(value: Any) -> object:
-    """Replace what strict JSON does not have: NaN becomes null, infinity a word."""
-    import math
-
-    if isinstance(value, Mapping):
-        return {key: _strict(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_strict(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None if math.isnan(value) else str(value)
-    return value.item() if hasattr(value, "item") else value
-
-
-def _export_parquet(frame: pd.DataFrame, to: Path | None) -> None:
-    import json
-
-    if importlib.util.find_spec("pyarrow") is None:
-        raise BadInput("Parquet needs pyarrow: pip install pyarrow, or choose --format csv")
-    if to is None:
-        raise BadInput("Parquet is no text: name a file with --to")
-    flat = frame.map(lambda value: json.dumps(value, ensure_ascii=False) if isinstance(value, (dict, list)) else value)
-    flat.to_parquet(to, index=False)
-    click.echo(f"written: {to}", err=True)
 
 
 def _write_text(path: Path, text: str) -> None:
