@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -24,6 +23,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from harness.environment import describe_environment
+from harness.files import replace_file
 from harness.measurement import Kind, Outcome, Verdict
 from harness.results import Frames, Results, ScoreRow, TaskRow
 from harness.run import plan_tasks
@@ -363,14 +363,9 @@ def write_baseline(path: Path, baseline: Baseline) -> None:
     Raises:
         BaselineError: the folder cannot be written to or is full; an older file is as it was.
     """
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            part.write_text(_to_text(baseline), encoding="utf-8")
-            part.replace(path)
-        finally:
-            part.unlink(missing_ok=True)
+        replace_file(path, _to_text(baseline).encode())
     except OSError as error:
         raise BaselineError(f"cannot write the baseline {path}: {error.strerror}; it is as it was") from error
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+from harness.files import replace_file
 from reports.scorecard import ReportError
 
 
@@ -23,18 +24,12 @@ def prepare(folder: str | os.PathLike[str]) -> Path:
 
 
 def write_whole(path: Path, content: bytes) -> Path:
-    """Write a file beside its place and rename it: a reader sees the old one or the new one, never a part.
+    """Write one file of a report, whole or not at all.
 
     Raises:
         ReportError: the folder cannot be written to or is full; an older file of the name is as it was.
     """
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        try:
-            part.write_bytes(content)
-            part.replace(path)
-        finally:
-            part.unlink(missing_ok=True)
+        return replace_file(path, content)
     except OSError as error:
         raise ReportError(f"cannot write {path}: {error.strerror}; choose another folder or free some space") from error
-    return path

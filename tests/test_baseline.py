@@ -354,10 +354,10 @@ def test_a_baseline_is_written_whole_or_not_at_all(tmp_path: Path, monkeypatch: 
     gate.write_baseline(path, accepted({PAIR: entry(energy_lost=0.0)}))
     before = path.read_bytes()
 
-    def full(self: Path, *_: object, **__: object) -> int:
+    def full(_file: int) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(Path, "write_text", full)
+    monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(BaselineError, match="No space left on device; it is as it was"):
         gate.write_baseline(path, accepted({PAIR: entry(energy_lost=1.0)}))
     assert path.read_bytes() == before

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
+import os
 from pathlib import Path
 
 import pandas as pd
@@ -325,11 +326,10 @@ def test_a_full_disk_keeps_the_older_file(tmp_path: Path, monkeypatch: pytest.Mo
     target = tmp_path / "rows.csv"
     target.write_text("older")
 
-    def full(self: Path, content: bytes) -> int:
-        self.touch()
+    def full(_file: int) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(Path, "write_bytes", full)
+    monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(ReportError, match="No space left on device"):
         files.write_whole(target, b"newer")
     assert target.read_text() == "older"
