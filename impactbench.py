@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from harness.store import PlannedTask, Store
     from scenarios import CATALOG
     from scenarios.scenario import Reference, Scenario
+    from scenarios.world.moving_scene import MovingScene
     from solvers import SOLVERS, ImpactProblem, ImpactSolution, ProblemError, Solver, Status, UnsupportedProblem
 
 _HOMES = {
@@ -311,6 +312,101 @@ def bench(
     sys.exit(EXIT_FAILED_TASKS if summary.lost else 0)
 
 
+@main.command(epilog=EXIT_CODES)
+@click.argument("scene", metavar="SCENE[:KEY=VALUE,…]")
+@click.option(
+    "--solver", "solver", default=None, metavar="NAME[:KEY=VALUE,…]",
+    help="Who solves the impacts: any solver, or qce-lcp-fast and qce-lcp-accurate, which are made for many spheres. "
+    "Default: the scene's own.",
+)  # fmt: skip
+@click.option("--steps", type=click.IntRange(min=1), default=None, metavar="N", help="Steps of the whole run.")
+@click.option(
+    "--cycles", type=click.IntRange(min=1), default=None, metavar="N",
+    help="Periods of what drives the scene, instead of --steps.",
+)  # fmt: skip
+@click.option("--until-pattern", is_flag=True, help="Stop when the scene's measures show what it is for.")
+@click.option(
+    "--frames", "frame_every", type=click.IntRange(min=1), default=None, metavar="N", help="Steps between two frames."
+)
+@click.option(
+    "--checkpoint", "checkpoint_every", type=click.IntRange(min=1), default=1000, show_default=True, metavar="N",
+    help="Steps between two checkpoints; an interruption leaves one too.",
+)  # fmt: skip
+@click.option("--pictures/--no-pictures", default=True, show_default=True, help="Draw stills of the run.")
+@click.option("--video", is_flag=True, help="Draw a video too; needs the extra: pip install 'impactbench[render]'.")
+@_seed_option
+@click.option("--fresh", is_flag=True, help="Set earlier results aside (renamed, not deleted) and start anew.")
+@click.option(
+    "--out", type=click.Path(file_okay=False, path_type=Path), default=Path("simulation"), show_default=True,
+    help="Results folder of this run alone.",
+)  # fmt: skip
+def simulate(
+    scene: str, solver: str | None, steps: int | None, cycles: int | None, until_pattern: bool,
+    frame_every: int | None, checkpoint_every: int, pictures: bool, video: bool, seed: int, fresh: bool, out: Path,
+) -> None:  # fmt: skip
+    """Run a moving scene; then write its page, figures and pictures.
+
+    Every step is a row of OUT/series.csv; frames, what the scene is judged by, and a checkpoint are kept beside it. An
+    interrupted run goes on, bit for bit, when the same command is given again, and so does one that is given more
+    steps. `impactbench list moving` names the scenes and their parameters.
+
+    \b
+    Examples:
+      impactbench simulate cradle-3d --solver qce --out cradle
+      impactbench simulate granular-shake --video --out shake
+      impactbench simulate extended-pattern:pattern=hexagons --cycles 300 --until-pattern --out hexagons
+    """  # noqa: D301
+    with _explained_errors():
+        from harness.selection import choose_moving, choose_resolver
+        from harness.simulation import Schedule, Simulation
+        from harness.simulation import simulate as run_simulation
+        from reports.progress import step_display
+
+        chosen = choose_moving(scene)
+        specification, law = choose_resolver(solver or chosen.default_solver)
+        schedule = Schedule(
+            steps=_wanted_steps(chosen, steps, cycles), frame_every=frame_every or chosen.frame_every,
+            checkpoint_every=checkpoint_every,
+        )  # fmt: skip
+        if fresh:
+            _set_aside(out)
+        _say(f"{chosen.label} by {specification}: {schedule.steps} steps; results go to {out}")
+        try:
+            with _terminated_as_interrupted(), step_display() as display:
+                why = run_simulation(
+                    Simulation(chosen, specification, law, seed), out, schedule, command=_command_line(),
+                    until=chosen.reached if until_pattern else lambda _: False, on_step=display,
+                )  # fmt: skip
+        except KeyboardInterrupt:
+            _say(f"\ninterrupted; the same command goes on:\n  {_command_line(without='--fresh')}")
+            sys.exit(EXIT_INTERRUPTED)
+        _say(why)
+        _write_simulation(out, color=chosen.color, pictures=pictures, video=video)
+
+
+def _wanted_steps(scene: MovingScene, steps: int | None, cycles: int | None) -> int:
+    """Steps of the whole run."""
+    if steps is not None and cycles is not None:
+        raise BadInput("--steps and --cycles say the same thing; give one")
+    if cycles is None:
+        return steps or scene.default_steps
+    if scene.steps_per_cycle == 0:
+        raise BadInput(f"{scene.name} has no cycles: nothing drives it; give --steps")
+    return cycles * scene.steps_per_cycle
+
+
+def _write_simulation(out: Path, *, color: str, pictures: bool, video: bool) -> None:
+    from reports.pictures import View
+    from reports.simulation import write_pictures, write_simulation
+
+    with _open(out) as store:
+        written = write_simulation(store, out)
+    if pictures or video:
+        written += write_pictures(out, color=color, video=video, view=View(), progress=_say)
+    click.echo((out / "simulation.md").read_text(encoding="utf-8"))
+    click.echo("written: " + ", ".join(str(path) for path in written if path.suffix in (".md", ".png", ".mp4")))
+
+
 @main.command()
 @_out_option
 def figures(out: Path) -> None:
@@ -358,9 +454,9 @@ def claims(out: Path) -> None:
 
 
 @main.command(name="list")
-@click.argument("what", type=click.Choice(["solvers", "scenarios", "sweeps", "tiers"]), required=False)
+@click.argument("what", type=click.Choice(["solvers", "scenarios", "moving", "sweeps", "tiers"]), required=False)
 def list_names(what: str | None) -> None:
-    """List solvers with their settings, scenarios with their parameters, sweeps, tiers.
+    """List solvers with their settings, scenarios and moving scenes with their parameters, sweeps, tiers.
 
     \b
     Examples:
@@ -369,7 +465,8 @@ def list_names(what: str | None) -> None:
     """  # noqa: D301
     with _explained_errors():
         sections: dict[str, Callable[[], None]] = {
-            "solvers": _list_solvers, "scenarios": _list_scenarios, "sweeps": _list_sweeps, "tiers": _list_tiers,
+            "solvers": _list_solvers, "scenarios": _list_scenarios, "moving": _list_moving, "sweeps": _list_sweeps,
+            "tiers": _list_tiers,
         }  # fmt: skip
         for name in [what] if what else sections:
             click.secho(name.upper(), bold=True)
@@ -741,6 +838,15 @@ def _list_scenarios() -> None:
         _print_entry(name, text, call)
 
 
+def _list_moving() -> None:
+    from scenarios import describe
+    from scenarios.moving import MOVING
+
+    for name in MOVING:
+        call, text = describe(name, MOVING)
+        _print_entry(name, text, call)
+
+
 def _list_sweeps() -> None:
     from harness.sweeps import SWEEPS
 
@@ -804,11 +910,12 @@ def _explained_errors() -> Iterator[None]:
     from harness.measurement import InvalidSolution
     from harness.results import ResultsError
     from harness.selection import SelectionError
+    from harness.simulation import SimulationError
     from harness.store import StoreError
 
     try:
         yield
-    except (StoreError, SelectionError, ResultsError, IsolationError, BaselineError) as error:
+    except (StoreError, SelectionError, ResultsError, IsolationError, BaselineError, SimulationError) as error:
         raise BadInput(str(error)) from error
     except InvalidSolution as error:
         raise click.ClickException(f"invalid answer: {error}") from error

@@ -29,6 +29,7 @@ from harness.checked import CLAIM_TOLERANCE, HONESTY_TOLERANCE, checked_solve, c
 from harness.measurement import InvalidSolution
 from harness.metamorphic import LARGE, in_units
 from harness.selection import setting_fields
+from harness.warm_start import Started, takes_start
 from scenarios import CATALOG
 from solvers import ImpactProblem, ImpactSolution, Solver, Status, UnsupportedProblem
 from solvers.solution import Floats
@@ -45,6 +46,7 @@ POINTS = {
     6: "bounded and honest",
     7: "refusal",
     8: "counts",
+    9: "start",
 }
 """Point of the contract in `solvers.Solver` → what it is about."""
 
@@ -53,6 +55,8 @@ POINTS = {
 UNIT_TOLERANCE = 1e-9
 # A solver that ignores a restitution of 0 or 0.5 is off by at least 0.5 of the approach; half of that is between.
 RESTITUTION_TOLERANCE = 0.25
+# Two answers that both meet a solver's tolerance, which is relative to the approach and far below this.
+START_TOLERANCE = 1e-6
 # Slip that is left over the slip before, above which a contact slides; friction must oppose what slides.
 SLIDING = 1e-6
 # Random problems of the kit are the same for everyone.
@@ -94,6 +98,8 @@ def solver_checks(solver: Solver) -> Iterator[tuple[str, Callable[[], None]]]:
         at_rest = problem.replace(v_pre=np.zeros(problem.n))
         yield _name(4, f"{name}, at rest"), partial(check_nothing_happens, solver, f"{name}, at rest", at_rest)
         yield _name(5, name), partial(check_units, solver, name, problem)
+        if takes_start(solver):
+            yield _name(9, name), partial(check_start, solver, name, problem)
     for name, problem in idle_problems().items():
         yield _name(4, name), partial(check_nothing_happens, solver, name, problem)
     for name, problem in every.items():
@@ -332,6 +338,23 @@ def check_counts(solver: Solver, name: str, problem: ImpactProblem) -> None:
             8, name, f"{pushing} contacts push, after {solution.iterations} iterations and {solution.visits} visits: "
             "both must count the work",
         )  # fmt: skip
+
+
+def check_start(solver: Solver, name: str, problem: ImpactProblem) -> None:
+    """Point 9: a start changes the way, not the answer, whether it is the answer or nonsense."""
+    cold = _solve(solver, 9, name, problem)
+    if cold is None or cold.impulse is None or cold.status is not Status.CONVERGED:
+        return
+    before = cold.impulse.copy()
+    for start, what in ((cold.impulse, "its own answer"), (np.full(problem.m, problem.speed), "any impulse")):
+        warm = _solve(Started(solver, start), 9, name, problem)
+        if warm is None:
+            _broken(9, name, f"it answers from zero and refuses to start from {what}")
+        difference = float(np.abs(warm.v_post - cold.v_post).max(initial=0.0))
+        if not difference <= START_TOLERANCE * problem.speed:
+            _broken(9, name, f"started from {what} it is {difference:.3g} away from its answer from zero")
+    if (cold.impulse != before).any():
+        _broken(9, name, "solve writes to its start")
 
 
 def _solve(solver: Solver, point: int, name: str, problem: ImpactProblem) -> ImpactSolution | None:

@@ -101,6 +101,8 @@ class Kind(Enum):
     """One solver over a family of scenes: the wave effect on chains, the disturbed cradle."""
     HARD_CASE = "hard case"
     """One solve of one scene on which laws break, and what it came to."""
+    SIMULATION = "simulation"
+    """A moving scene: the whole run, or the impact of one of its steps."""
 
 
 @dataclass(frozen=True)

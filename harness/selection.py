@@ -25,14 +25,17 @@ import inspect
 import sys
 import types
 import typing
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 from scenarios import CATALOG
+from scenarios.moving import MOVING
 from scenarios.scenario import Scenario
+from scenarios.world.impact import Streamed
+from scenarios.world.moving_scene import STREAMED, MovingScene
 from solvers import PEERS, SOLVERS, Solver
 
 ENTRY_POINT_GROUP = "impactbench.solvers"
@@ -124,7 +127,50 @@ def choose_scenarios(specification: str, extra_names: Iterable[str] = ()) -> tup
     if not matching:
         raise SelectionError(unknown("scenario", pattern, names))
     texts = _split_pairs(text, specification)
-    return tuple(ScenarioChoice(name, _read_parameters(name, texts), exact=bool(texts)) for name in matching)
+    chosen = []
+    for name in matching:
+        if texts and name not in CATALOG:
+            raise SelectionError(f"{name} is a sweep and takes no parameters")
+        parameters = _read_parameters(name, CATALOG[name], texts) if texts else {}
+        if parameters:
+            build_scenario(name, parameters)
+        chosen.append(ScenarioChoice(name, parameters, exact=bool(texts)))
+    return tuple(chosen)
+
+
+def choose_moving(specification: str) -> MovingScene:
+    """Make a moving scene from its name and parameters, as "extended-pattern:pattern=stripes".
+
+    Raises:
+        SelectionError: the scene or a parameter does not exist, or a value is refused.
+    """
+    name, _, text = specification.partition(":")
+    if name not in MOVING:
+        raise SelectionError(unknown("moving scene", name, MOVING))
+    parameters = _read_parameters(name, MOVING[name], _split_pairs(text, specification))
+    try:
+        return MOVING[name](**parameters)
+    except (TypeError, ValueError) as error:
+        raise SelectionError(f"scene {name} refuses its parameters: {error}") from error
+
+
+def choose_resolver(specification: str) -> tuple[str, Solver | Streamed]:
+    """Make what solves the impacts of a moving scene: a solver, or a packed one of `STREAMED`.
+
+    Returns:
+        The specification in one spelling, and the solver.
+
+    Raises:
+        SelectionError: as `choose_solver`.
+    """
+    name, _, text = specification.partition(":")
+    if name not in STREAMED:
+        if name not in available_solvers() and ".py" not in specification:
+            raise SelectionError(unknown("solver", name, (*available_solvers(), *STREAMED)))
+        choice = choose_solver(specification)
+        return choice.specification, choice.solver
+    given = _read_settings(Streamed, name, text)
+    return _canonical(name, given), dataclasses.replace(STREAMED[name], **given)  # type: ignore[arg-type]
 
 
 def build_scenario(name: str, parameters: Mapping[str, object]) -> Scenario:
@@ -268,20 +314,14 @@ def _read_settings(law: type[Any], name: str, text: str) -> dict[str, object]:
     return {key: _convert(value, types_of.get(key, object), f"{name}: {key}") for key, value in pairs.items()}
 
 
-def _read_parameters(name: str, texts: Mapping[str, str]) -> dict[str, object]:
-    """Convert a family's parameters by its annotations, and build the scene once to check them."""
-    if not texts:
-        return {}
-    if name not in CATALOG:
-        raise SelectionError(f"{name} is a sweep and takes no parameters")
-    known = inspect.signature(CATALOG[name]).parameters
+def _read_parameters(name: str, family: Callable[..., object], texts: Mapping[str, str]) -> dict[str, object]:
+    """Convert a family's parameters by its annotations."""
+    known = inspect.signature(family).parameters
     for key in texts:
         if key not in known:
             raise SelectionError(f"scenario {name}: " + unknown("parameter", key, known))
-    types_of = typing.get_type_hints(CATALOG[name])
-    parameters = {key: _convert(text, types_of.get(key, object), f"{name}: {key}") for key, text in texts.items()}
-    build_scenario(name, parameters)
-    return parameters
+    types_of = typing.get_type_hints(family)
+    return {key: _convert(text, types_of.get(key, object), f"{name}: {key}") for key, text in texts.items()}
 
 
 def _convert(text: str, wanted: Any, where: str) -> object:

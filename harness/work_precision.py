@@ -1,11 +1,12 @@
 """Speed against error: what a solver's accuracy costs, how the cost grows, where it breaks. Plan and run.
 
-Four kinds of task, each one solver at one setting on one scene in a child process, stored like a sweep:
+Five kinds of task, each one solver at one setting on one scene in a child process, stored like a sweep:
 
     errors    one solve and its errors, verification and validation apart; never timed
     times     repeated solves, never looked at; one task a round, so that repeats of all solvers alternate
     scaling   times with default settings over the number of contacts, and memory
     cold      the first solve in a fresh process
+    warm      steps of a layer at rest, each from zero and from the impulse of the step before
 
 The work of a setting is its time, and its contact visits, which no machine changes. What failed in one task is not run
 again in its later rounds or at larger sizes: those rows carry the same outcome and say so.
@@ -14,13 +15,12 @@ again in its later rounds or at larger sizes: those rows carry the same outcome 
 from __future__ import annotations
 
 import functools
-import inspect
 import json
 import math
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -47,14 +47,15 @@ from harness.selection import (
 from harness.statistics import summarize
 from harness.store import Ending, PlannedTask, Store
 from harness.timing import Timing, time_first_solves, time_solver
+from harness.warm_start import measure_warm_start, takes_start
 from scenarios.scenario import Scenario
 from solvers import ImpactProblem, ImpactSolution, Solver
 from solvers.solution import Floats
 
 Scenes: TypeAlias = tuple[tuple[str, dict[str, object]], ...]
 
-ERRORS, TIMES, SCALING, COLD = "errors", "times", "scaling", "cold"
-RUNS = (ERRORS, TIMES, SCALING, COLD)
+ERRORS, TIMES, SCALING, COLD, WARM = "errors", "times", "scaling", "cold", "warm"
+RUNS = (ERRORS, TIMES, SCALING, COLD, WARM)
 """Names of the tasks, in the order in which they run."""
 # How the reason of a task begins that took over the ending of another one.
 PASSED_OVER = "not run again"
@@ -86,6 +87,8 @@ class Dial:
     """Contacts from which on the dial does anything."""
     most: float = math.inf
     """Contacts up to which it does."""
+    paired: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    """Field → its value beside each of `values`, where the two belong together."""
 
     @property
     def field(self) -> str:
@@ -108,7 +111,14 @@ _COMPLIANT = (
 )
 
 DIALS: dict[str, tuple[Dial, ...]] = {
-    "ehi": (Dial({"steps_per_contact": 1.0}, STEPS),),
+    # Coarse steps and a short memory of gaps save time together: the pairs are the cheapest of each error (measured).
+    "ehi": (
+        Dial(
+            {"steps_per_contact": 1.0},
+            (1.75, 2.0, 2.5, 3.0, 4.0, 8.0, 16.0, 32.0, 64.0),
+            paired={"gap_memory": (0.3, 0.2, 0.1, 0.05, 0.03, 0.01, 0.003, 0.001, 0.0)},
+        ),
+    ),
     "gauss-seidel": (Dial({"max_iterations": 1.0}, PASSES),),
     # The inner LCP must be tighter than the outer test, or packs come out up to 10 % wrong.
     "gr": (Dial({"tolerance": 1.0, "inner_tolerance": 1e-3}, TOLERANCES),),
@@ -138,11 +148,14 @@ class Extent:
     """Spheres of the scaling packs."""
     chain_sizes: tuple[int, ...]
     """Balls of the scaling chains."""
+    resting: int
+    """Spheres of the layer that rests, for the warm start."""
     repeats: int
 
 
 _CHAIN: tuple[str, dict[str, object]] = ("three-ball-chain", {"va": 0.5})
 _SMALL_PACK: tuple[str, dict[str, object]] = ("sphere-pack", {"spheres": 100, "start": "hot"})
+_RESTING: dict[str, object] = {"restitution": 0.0}
 _SINGLE: Scenes = (_CHAIN, ("newtons-cradle", {"balls": 5}), ("pool-break", {}), ("box-on-floor", {"points": 9}))
 
 
@@ -152,10 +165,10 @@ def _packs(*sizes: int) -> Scenes:
 
 
 TIERS: dict[str, Extent] = {
-    "smoke": Extent((_CHAIN, _SMALL_PACK), (100, 200, 400), (11, 31, 101), 2),
-    "default": Extent((*_SINGLE, *_packs(300, 1000)), (300, 1000, 2000, 4000), (11, 101, 301, 1001), 3),
+    "smoke": Extent((_CHAIN, _SMALL_PACK), (100, 200, 400), (11, 31, 101), 100, 2),
+    "default": Extent((*_SINGLE, *_packs(300, 1000)), (300, 1000, 2000, 4000), (11, 101, 301, 1001), 300, 3),
     "full": Extent(
-        (*_SINGLE, *_packs(300, 1000, 4000)), (300, 1000, 4000, 15_000, 60_000), (11, 101, 301, 1001, 10_001), 7
+        (*_SINGLE, *_packs(300, 1000, 4000)), (300, 1000, 4000, 15_000, 60_000), (11, 101, 301, 1001, 10_001), 1000, 7
     ),
 }
 """Tier → what a bench measures: seconds, minutes, a night."""
@@ -198,6 +211,9 @@ def plan_bench(
     if not scenarios:
         scene = build_scenario(*_CHAIN)
         planned += [_planned(COLD, point, scene, seed, round=k) for k in range(extent.repeats) for point in plain]
+        layer = build_scenario("sphere-pack", _seeded("sphere-pack", {"spheres": extent.resting, **_RESTING}, seed))
+        started = [point for point in plain if takes_start(point.law.solver)]
+        planned += [_planned(WARM, point, layer, seed, round=k) for k in range(extent.repeats) for point in started]
     if not planned:
         raise SelectionError("nothing to measure: no scene was chosen")
     return planned
@@ -284,6 +300,8 @@ def measure_bench(task: Task) -> Measurement:
         return measure_errors(solver, scene, limit=measured_by)
     if task.scenario == COLD:
         return _measure_cold(solver, scene)
+    if task.scenario == WARM:
+        return _measure_warm(solver, scene, task.seed)
     return _timing_measurement(time_solver(solver, scene.problem), scene.problem)
 
 
@@ -340,9 +358,7 @@ def _extent(tier: str, sizes: Sequence[int], repeats: int | None) -> Extent:
     if repeats is not None and repeats <= 0:
         raise SelectionError(f"repeats must be positive, not {repeats}")
     extent = TIERS[tier]
-    return Extent(
-        extent.scenes, tuple(sorted(set(sizes))) or extent.pack_sizes, extent.chain_sizes, repeats or extent.repeats
-    )
+    return replace(extent, pack_sizes=tuple(sorted(set(sizes))) or extent.pack_sizes, repeats=repeats or extent.repeats)
 
 
 def _chosen(extent: Extent, scenarios: Sequence[ScenarioChoice], seed: int) -> list[tuple[str, Mapping[str, object]]]:
@@ -386,6 +402,7 @@ def _at(choice: SolverChoice, dial: Dial, value: float) -> str:
         for field, factor in dial.factors.items()
         if field in default
     }
+    settings |= {field: values[dial.values.index(value)] for field, values in dial.paired.items() if field in default}
     text = ",".join(f"{field}={setting!r}" for field, setting in settings.items())
     separator = ":" if choice.specification == choice.name else ","
     return choose_solver(f"{choice.specification}{separator}{text}").specification
@@ -606,13 +623,14 @@ def _error(metric: str, value: float) -> Score:
 
 def _measure_cold(solver: Solver, scene: Scenario) -> Measurement:
     first_s, second_s = time_first_solves(solver, scene.problem)
-    columns = {"first_s": first_s, "second_s": second_s, "takes_start": takes_start(solver)}
+    columns = {"first_s": first_s, "second_s": second_s}
     return Measurement("", 0, 0, (), (Series(COLD, columns),))
 
 
-def takes_start(solver: Solver) -> bool:
-    """Tell whether a solver can start from an earlier impulse: its `solve` has a parameter `start`."""
-    return "start" in inspect.signature(solver.solve).parameters
+def _measure_warm(solver: Solver, scene: Scenario, seed: int) -> Measurement:
+    spheres = scene.parameters["spheres"]
+    assert isinstance(spheres, int)
+    return Measurement("", 0, 0, (), (Series(WARM, asdict(measure_warm_start(solver, spheres, seed=seed))),))
 
 
 def _timing_measurement(timing: Timing, problem: ImpactProblem) -> Measurement:

@@ -86,7 +86,8 @@ def bench_markdown(bench: Bench) -> str:
     """The whole bench as one Markdown page."""
     sections = (
         _heading(bench), _table_2(bench), _reach_section(bench), _finest_section(bench), _profile_section(bench),
-        _ratio_section(bench), _scaling_section(bench), _cold_section(bench), _lost_section(bench),
+        _ratio_section(bench), _scaling_section(bench), _cold_section(bench), _warm_section(bench),
+        _lost_section(bench),
     )  # fmt: skip
     return "\n".join(line for section in sections for line in section) + "\n"
 
@@ -344,25 +345,49 @@ def _size_row(point: Point) -> tuple[str, ...]:
 
 
 def _cold_section(bench: Bench) -> list[str]:
-    """First and second solve; and why there is no warm start."""
-    lines = ["## Cold and warm", ""]
-    if bench.first_solves:
-        body = [
-            (first.law, _seconds(first.first.median), _seconds(first.second.median), str(first.first.count))
-            for first in bench.first_solves
-        ]
-        lines += [
-            "First solve in a fresh process (kernels are read from the cache), and the second one; three balls.",
-            "",
-            *markdown_table(("law", "first", "second", "processes"), body),
-            "",
-        ]
-    able = [first.law for first in bench.first_solves if first.takes_start]
-    warm = (
-        f"taken by {', '.join(able)}; not measured here." if able
-        else "not applicable: no solver here takes a start, each impact is solved from zero."
+    """First and second solve in a process."""
+    if not bench.first_solves:
+        return []
+    body = [
+        (first.law, _seconds(first.first.median), _seconds(first.second.median), str(first.first.count))
+        for first in bench.first_solves
+    ]
+    return [
+        "## First solve",
+        "",
+        "First solve in a fresh process (kernels are read from the cache), and the second one; three balls.",
+        "",
+        *markdown_table(("law", "first", "second", "processes"), body),
+        "",
+    ]
+
+
+def _warm_section(bench: Bench) -> list[str]:
+    """Warm start over a sequence of impacts."""
+    if not bench.warm_steps:
+        return []
+    body = [
+        (
+            steps.law, steps.scene, str(steps.steps), _seconds(steps.cold.median), _seconds(steps.warm.median),
+            f"{steps.cold.median / steps.warm.median:.2f}" if steps.warm.median > 0 else "–",
+            f"{_count(steps.cold_visits)} → {_count(steps.warm_visits)}", number(steps.difference),
+            ", ".join(steps.statuses),
+        )
+        for steps in bench.warm_steps
+    ]  # fmt: skip
+    heading = (
+        "law", "layer", "steps", "cold", "warm", "cold / warm", "contact visits", "difference of the answers", "status",
     )  # fmt: skip
-    return [*lines, f"Warm start over a sequence of impacts: {warm}", ""]
+    return [
+        "## Cold and warm start over a sequence of impacts",
+        "",
+        "A layer comes down, then rests under gravity step by step (restitution 0); every step is solved from zero and "
+        "from the impulse that the same solver found a step before. Time of all steps together, median over rounds. "
+        "Laws that are not here start from zero always: their answer depends on its way.",
+        "",
+        *markdown_table(heading, body),
+        "",
+    ]
 
 
 def _lost_section(bench: Bench) -> list[str]:

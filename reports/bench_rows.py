@@ -18,7 +18,7 @@ from harness.measurement import Outcome
 from harness.results import Frames
 from harness.statistics import PowerLaw, Repeats, cost_to_reach, fit_power_law, summarize
 from harness.timing import is_noisy
-from harness.work_precision import COLD, ERRORS, RUNS, SCALING, TIMES, VERIFICATION
+from harness.work_precision import COLD, ERRORS, RUNS, SCALING, TIMES, VERIFICATION, WARM
 from reports.scorecard import ReportError
 from solvers.solution import Floats, Status
 
@@ -107,8 +107,24 @@ class FirstSolve:
     law: str
     first: Repeats
     second: Repeats
-    takes_start: bool
-    """The solver can start from an earlier impulse."""
+
+
+@dataclass(frozen=True)
+class WarmSteps:
+    """Steps of a layer at rest, from zero and from the impulse of the step before."""
+
+    law: str
+    scene: str
+    steps: int
+    cold: Repeats
+    """CPU time of all steps from zero [s]."""
+    warm: Repeats
+    """CPU time of all steps from the last impulse [s]."""
+    cold_visits: int
+    warm_visits: int
+    difference: float
+    """Largest |v_warm - v_cold| over the speed with which the layer came down."""
+    statuses: tuple[str, ...]
 
 
 class Bench:
@@ -127,7 +143,7 @@ class Bench:
         if not self._tasks:
             raise ReportError("the store holds no bench; measure one first: impactbench bench")
         self._series = {
-            int(row.task): row.columns for row in store.frame("series").itertuples() if row.name in (TIMES, COLD)
+            int(row.task): row.columns for row in store.frame("series").itertuples() if row.name in (TIMES, COLD, WARM)
         }
         self._scores: dict[int, list[Any]] = {}
         for row in store.frame("scores").itertuples():
@@ -174,10 +190,26 @@ class Bench:
                 law,
                 summarize([c["first_s"] for c in rounds]),
                 summarize([c["second_s"] for c in rounds]),
-                any(c.get("takes_start", False) for c in rounds),
             )
             for law, rounds in found.items()
         )
+
+    @cached_property
+    def warm_steps(self) -> tuple[WarmSteps, ...]:
+        """Cold and warm start over a sequence of impacts, one a law."""
+        found: dict[tuple[str, str], list[Mapping[str, Any]]] = {}
+        for row in self._tasks:
+            if row.scenario == WARM and int(row.task) in self._series:
+                found.setdefault((row.parameters["law"], row.label), []).append(self._series[int(row.task)])
+        return tuple(
+            WarmSteps(
+                law, scene, len(rounds[0]["cold_s"]),
+                summarize([sum(c["cold_s"]) for c in rounds]), summarize([sum(c["warm_s"]) for c in rounds]),
+                sum(rounds[0]["cold_visits"]), sum(rounds[0]["warm_visits"]),
+                max(c["difference"] for c in rounds), tuple(rounds[0]["statuses"]),
+            )
+            for (law, scene), rounds in found.items()
+        )  # fmt: skip
 
     def lost(self) -> list[tuple[str, str, str, str]]:
         """Run, solver, scene and reason of all that ended without an answer, each once."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 from scenarios.billiards import bernoulli, four_ball_circle, pool_break
 from scenarios.chains import disturbed_cradle, newtons_cradle, three_ball_bounce, three_ball_chain
@@ -48,9 +48,9 @@ CATALOG: dict[str, Callable[..., Scenario]] = {
 """Name → scenario family. Adding one is one file and one line here."""
 
 
-def describe(name: str) -> tuple[str, str]:
+def describe(name: str, families: Mapping[str, Callable[..., object]] = CATALOG) -> tuple[str, str]:
     """A family as a call with its defaults, and what it is: the first line of its docstring."""
-    family = CATALOG[name]
+    family = families[name]
     parameters = inspect.signature(family).parameters.values()
     call = ", ".join(f"{parameter.name}={parameter.default!r}" for parameter in parameters)
     return f"{name}({call})", (inspect.getdoc(family) or "").partition("\n")[0]

@@ -144,7 +144,7 @@ HARD_CASES: dict[str, tuple[Instance, ...]] = {
         ("long-chain", {"balls": 1000, "start": "converging"}),
         ("long-chain", {"balls": 1000, "restitution": 0.0}),
         ("long-chain", {"balls": 100_000}),
-        ("long-chain", {"balls": 10_000, "start": "converging"}),
+        ("long-chain", {"balls": 100_000, "start": "converging"}),
         ("long-chain", {"balls": 100_000, "restitution": 0.0}),
     ),
     "W without full rank": (

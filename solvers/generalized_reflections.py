@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from solvers import boxed_lcp, recovery
+from solvers import boxed_lcp, cone_projection, recovery
 from solvers.problem import ImpactProblem
 from solvers.solution import Floats, ImpactSolution, Status, UnsupportedProblem
 
@@ -36,6 +36,9 @@ class GeneralizedReflections:
     max_inner_sweeps: int = 20_000
     """Bound on the sweeps of one inelastic LCP, and of the friction solve."""
 
+    max_visits: int = boxed_lcp.MAX_VISITS
+    """Bound on contact visits: of the reflections together, of the inelastic LCP, and of the friction solve."""
+
     recover_after: int = 0
     """Reflections after which what still approaches is resolved inelastically; 0 = never (the published law)."""
 
@@ -43,70 +46,91 @@ class GeneralizedReflections:
         """Solve one multi-impact.
 
         Raises:
-            UnsupportedProblem: the contacts have different restitution.
+            UnsupportedProblem: the contacts have different restitution, or bodies have too many of them.
         """
         restitution = one_restitution(problem, "generalized reflections take")
         if self.recover_after:
             return recovery.resolve(
                 problem, replace(self, recover_after=0, max_iterations=self.recover_after).solve(problem)
             )
-        impulse, status, iterations, visits = np.zeros(problem.m), Status.CONVERGED, 0, 0
-        if restitution > 0.0:
-            impulse, status, iterations, visits = self._reflect(problem)
-        if restitution < 1.0:
-            plastic = boxed_lcp.project(
-                problem, np.zeros(problem.m), tolerance=self.inner_tolerance, max_sweeps=self.max_inner_sweeps
-            )
-            impulse = (1.0 - restitution) * plastic.impulse + restitution * impulse
-            iterations += 1
-            visits += plastic.visits
-            status = _worse(status, plastic.residual, self.tolerance)
-        friction_impulse = None
-        if problem.has_friction:
-            friction = boxed_lcp.dissipate(problem, impulse, tolerance=self.tolerance, max_sweeps=self.max_inner_sweeps)
-            friction_impulse = friction.friction_impulse
-            visits += friction.visits
-            status = _worse(status, friction.residual, self.tolerance)
-        v_post = problem.v_after(impulse, friction_impulse)
-        if not np.isfinite(v_post).all():
-            status = Status.NOT_FINITE
-        u_min = float((problem.J @ v_post).min(initial=0.0))
-        residual = max(-u_min, 0.0) / (problem.speed or 1.0)
-        if problem.has_friction:
-            # The friction solve moves the normal velocities, and the law has no second look at them.
-            status = _worse(status, residual, self.tolerance)
-        return ImpactSolution(impulse, v_post, status, iterations, visits, residual, friction_impulse)
+        solution = self._reflect(problem) if restitution == 1.0 else self._mean(problem, restitution)
+        return self._with_friction(problem, solution) if problem.has_friction else solution
 
-    def _reflect(self, problem: ImpactProblem) -> tuple[Floats, Status, int, int]:
-        """Reflect until no contact is violated; impulse, status, reflections, contact visits."""
-        impulse = np.zeros(problem.m)
-        rest = np.zeros(problem.m)
-        v = problem.v_pre.copy()
-        status = Status.CONVERGED
-        visits = 0
-        for iteration in range(self.max_iterations + 1):
-            violated = np.flatnonzero(problem.J @ v < -self.tolerance * problem.speed).astype(np.int32)
-            visits += problem.m
-            if violated.size == 0:
-                return impulse, status, iteration, visits
-            if iteration == self.max_iterations:
-                break
-            inner = boxed_lcp.project(
-                problem,
-                rest,
-                rows=violated,
-                v_start=v,
-                tolerance=self.inner_tolerance,
-                max_sweeps=self.max_inner_sweeps,
-            )
-            visits += inner.visits
-            # Twice the change: the reflection of v about the face of the inelastic outcome.
-            v = 2.0 * inner.v - v
-            impulse += 2.0 * inner.impulse
-            if inner.residual > self.tolerance:
-                # An inner LCP that is not solved to the tolerance on u spoils everything after it.
-                status = Status.STALLED
-        return impulse, Status.ITERATION_LIMIT, self.max_iterations, visits
+    def _reflect(self, problem: ImpactProblem) -> ImpactSolution:
+        """Reflect until no contact is violated: the elastic law."""
+        speed = problem.speed or 1.0
+        impulse, v, iterations, left, visits, inner_residual = cone_projection.reflect(
+            problem,
+            threshold=self.tolerance * problem.speed,
+            tolerance=self.inner_tolerance * speed,
+            max_iterations=self.max_iterations,
+            max_sweeps=self.max_inner_sweeps,
+            max_visits=self.max_visits,
+        )
+        if not np.isfinite(v).all():
+            status = Status.NOT_FINITE
+        elif left:
+            status = Status.ITERATION_LIMIT
+        elif inner_residual > self.tolerance * speed:
+            # An inner LCP that is not solved to the tolerance on u spoils everything after it.
+            status = Status.STALLED
+        else:
+            status = Status.CONVERGED
+        return ImpactSolution(impulse, v, status, iterations, visits, _approach(problem, v))
+
+    def _mean(self, problem: ImpactProblem, restitution: float) -> ImpactSolution:
+        """Mean of the inelastic LCP and the reflections (GRR); without restitution there are none."""
+        reflected = ImpactSolution(np.zeros(problem.m), problem.v_pre, Status.CONVERGED, 0, 0)
+        if restitution > 0.0:
+            reflected = self._reflect(problem)
+        plastic = boxed_lcp.project(
+            problem,
+            np.zeros(problem.m),
+            tolerance=self.inner_tolerance,
+            max_sweeps=self.max_inner_sweeps,
+            max_visits=self.max_visits,
+        )
+        status = _worse(reflected.status, plastic.residual, self.tolerance)
+        if status is Status.STALLED and (plastic.sweeps >= self.max_inner_sweeps or plastic.visits >= self.max_visits):
+            status = Status.ITERATION_LIMIT
+        assert reflected.impulse is not None
+        v = (1.0 - restitution) * plastic.v + restitution * reflected.v_post
+        return ImpactSolution(
+            (1.0 - restitution) * plastic.impulse + restitution * reflected.impulse,
+            v,
+            status,
+            reflected.iterations + 1,
+            reflected.visits + plastic.visits,
+            _approach(problem, v),
+        )
+
+    def _with_friction(self, problem: ImpactProblem, solution: ImpactSolution) -> ImpactSolution:
+        """Add the friction impulse of maximum dissipation at these normal impulses."""
+        assert solution.impulse is not None
+        friction = boxed_lcp.dissipate(
+            problem,
+            solution.impulse,
+            v_start=solution.v_post,
+            tolerance=self.tolerance,
+            max_sweeps=self.max_inner_sweeps,
+            max_visits=self.max_visits,
+        )
+        residual = _approach(problem, friction.v)
+        return ImpactSolution(
+            solution.impulse,
+            friction.v,
+            # The friction solve moves the normal velocities, and the law has no second look at them.
+            _worse(solution.status, max(friction.residual, residual), self.tolerance),
+            solution.iterations,
+            solution.visits + friction.visits,
+            residual,
+            friction.friction_impulse,
+        )
+
+
+def _approach(problem: ImpactProblem, v: Floats) -> float:
+    """Fastest approach that is left, over the largest |u_pre|."""
+    return max(0.0, -float((problem.J @ v).min(initial=0.0))) / (problem.speed or 1.0)
 
 
 def one_restitution(problem: ImpactProblem, law: str) -> float:

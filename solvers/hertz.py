@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from solvers.compression import ADAPTIVE_CONTACTS, check_settings, integrate_with_gaps
+from solvers.compression import Compliance, integrate_with_gaps
 from solvers.problem import ImpactProblem
 from solvers.solution import Floats, ImpactSolution, UnsupportedProblem
 
@@ -29,26 +29,8 @@ ROUNDING = 1e-14
 
 
 @dataclass(frozen=True)
-class Hertz:
+class Hertz(Compliance):
     """Compliant contacts with memory of gaps; elastic and without friction."""
-
-    exponent: float = 1.5
-    """η of the contact force k δ^η, ≥ 1: 3/2 is Hertz, 1 a linear spring. Dimensionless."""
-
-    tolerance: float = 1e-12
-    """Error of one step of the adaptive method, relative to the largest speed and compression (small problems)."""
-
-    steps_per_contact: float = 50.0
-    """Leapfrog steps within the shortest contact, all neighbors pressing with it (large problems)."""
-
-    adaptive_contacts: int = ADAPTIVE_CONTACTS
-    """Problems of up to so many contacts are small."""
-
-    max_visits: int = 4_000_000
-    """Bound on contact evaluations, besides 5,000 for each contact."""
-
-    def __post_init__(self) -> None:
-        check_settings(self.exponent, self.tolerance, self.steps_per_contact)
 
     def solve(self, problem: ImpactProblem) -> ImpactSolution:
         """Solve one multi-impact; restitution and friction must be 1 and 0.
@@ -60,10 +42,7 @@ class Hertz:
             raise UnsupportedProblem("hertz is an elastic law: restitution must be 1 (lzb takes any above its bound)")
         if problem.has_friction:
             raise UnsupportedProblem("hertz has no friction: friction must be 0")
-        return integrate_with_gaps(
-            problem, exponent=self.exponent, tolerance=self.tolerance, steps_per_contact=self.steps_per_contact,
-            adaptive_contacts=self.adaptive_contacts, max_visits=self.max_visits,
-        )  # fmt: skip
+        return integrate_with_gaps(problem, self)
 
 
 def hertz_reference(problem: ImpactProblem, *, exponent: float = 1.5) -> tuple[Floats, float]:

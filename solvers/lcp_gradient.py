@@ -21,6 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from solvers._jit import kernel
+from solvers.boxed_lcp import MAX_VISITS, first_guess
 from solvers.problem import ImpactProblem
 from solvers.solution import Floats, ImpactSolution, Status, UnsupportedProblem
 from solvers.sphere_rows import sphere_rows
@@ -49,9 +50,23 @@ class AcceleratedProjectedGradient:
     max_iterations: int = 20_000
     """Bound on steps, each one product with W."""
 
-    def solve(self, problem: ImpactProblem) -> ImpactSolution:
-        """Solve one multi-impact with any restitution per contact, without friction."""
-        return _solution(problem, _accelerated, self.tolerance, self.max_iterations)
+    max_visits: int = MAX_VISITS
+    """Bound on contact visits; one step may exceed it by two products."""
+
+    def solve(self, problem: ImpactProblem, *, start: Floats | None = None) -> ImpactSolution:
+        """Solve one multi-impact with any restitution per contact, without friction.
+
+        Args:
+            problem: the impact.
+            start: first guess of the normal impulse [N s], shape (m,); a pull counts as 0.
+
+        Raises:
+            UnsupportedProblem: friction.
+            ProblemError: the guess has another shape or is not finite.
+        """
+        return _solution(
+            problem, _accelerated, first_guess(problem, start), self.tolerance, self.max_iterations, self.max_visits
+        )
 
 
 @dataclass(frozen=True)
@@ -64,12 +79,28 @@ class SpectralProjectedGradient:
     max_iterations: int = 20_000
     """Bound on steps, each one product with W."""
 
-    def solve(self, problem: ImpactProblem) -> ImpactSolution:
-        """Solve one multi-impact with any restitution per contact, without friction."""
-        return _solution(problem, _spectral, self.tolerance, self.max_iterations)
+    max_visits: int = MAX_VISITS
+    """Bound on contact visits; one step may exceed it by two products."""
+
+    def solve(self, problem: ImpactProblem, *, start: Floats | None = None) -> ImpactSolution:
+        """Solve one multi-impact with any restitution per contact, without friction.
+
+        Args:
+            problem: the impact.
+            start: first guess of the normal impulse [N s], shape (m,); a pull counts as 0.
+
+        Raises:
+            UnsupportedProblem: friction.
+            ProblemError: the guess has another shape or is not finite.
+        """
+        return _solution(
+            problem, _spectral, first_guess(problem, start), self.tolerance, self.max_iterations, self.max_visits
+        )
 
 
-def _solution(problem: ImpactProblem, method: object, tolerance: float, max_iterations: int) -> ImpactSolution:
+def _solution(
+    problem: ImpactProblem, method: object, guess: Floats, tolerance: float, max_iterations: int, max_visits: int
+) -> ImpactSolution:
     """Run one of the two kernels on the scaled problem, and judge what it reached."""
     if problem.has_friction:
         raise UnsupportedProblem("projected gradients have no friction here: friction must be 0 (lcp-pgs takes any)")
@@ -91,7 +122,7 @@ def _solution(problem: ImpactProblem, method: object, tolerance: float, max_iter
         normal, body, inverse_mass,
         J.indptr, J.indices.view(np.uint32), J_scaled, JM.indptr, JM.indices.view(np.uint32), JM_scaled,
         np.zeros(problem.n), np.zeros((inverse_mass.size, 3)),
-        scale[order], b, tolerance * speed, max_iterations,
+        scale[order], b, (scale * guess)[order], tolerance * speed, max_iterations, max_visits,
     )  # fmt: skip
     impulse = np.empty(problem.m)
     impulse[order] = y
@@ -150,25 +181,25 @@ def _product(
 def _accelerated(
     normal: Floats, body: Indices, inverse_mass: Floats,
     J_start: Ints, J_index: Indices, J: Floats, JM_start: Ints, JM_index: Indices, JM: Floats, dv: Floats, dV: Floats,
-    scale: Floats, b: Floats, tolerance: float, max_iterations: int,
+    scale: Floats, b: Floats, y: Floats, tolerance: float, max_iterations: int, max_visits: int,
 ) -> tuple[Floats, int, int]:  # fmt: skip
-    """Accelerated projected gradient from zero; returns the best y, iterations, contact visits."""
+    """Accelerated projected gradient from a guess (changed); returns the best y, iterations, contact visits."""
     m = b.size
-    best = np.zeros(m)
+    Wy = np.zeros(m)
+    _product(normal, body, inverse_mass, J_start, J_index, J, JM_start, JM_index, JM, dv, dV, y, Wy)
+    best = y.copy()
     best_residual = 0.0
     for i in range(m):
-        best_residual = max(best_residual, abs(min(scale[i] * b[i], 0.0)))
+        best_residual = max(best_residual, scale[i] * abs(min(Wy[i] + b[i], y[i])))
     before = np.zeros(m)
     W_before = np.zeros(m)
-    y = np.zeros(m)
-    Wy = np.zeros(m)
     after = np.zeros(m)
     W_after = np.zeros(m)
     L = 1.0
     momentum = 1.0
     beta = 0.0
     iterations = 0
-    while best_residual > tolerance and iterations < max_iterations:
+    while best_residual > tolerance and iterations < max_iterations and m * (iterations + 1) < max_visits:
         iterations += 1
         # A projected step from x = y + beta (y - before); its gradient by linearity.
         for i in range(m):
@@ -203,32 +234,34 @@ def _accelerated(
         momentum = following
         before, y, after = y, after, before
         W_before, Wy, W_after = Wy, W_after, W_before
-    return best, iterations, m * iterations
+    return best, iterations, m * (iterations + 1)
 
 
 @kernel
 def _spectral(
     normal: Floats, body: Indices, inverse_mass: Floats,
     J_start: Ints, J_index: Indices, J: Floats, JM_start: Ints, JM_index: Indices, JM: Floats, dv: Floats, dV: Floats,
-    scale: Floats, b: Floats, tolerance: float, max_iterations: int,
+    scale: Floats, b: Floats, y: Floats, tolerance: float, max_iterations: int, max_visits: int,
 ) -> tuple[Floats, int, int]:  # fmt: skip
-    """Spectral projected gradient from zero; returns the best y, iterations, contact visits."""
+    """Spectral projected gradient from a guess (changed); returns the best y, iterations, contact visits."""
     m = b.size
-    best = np.zeros(m)
+    g = np.zeros(m)
+    _product(normal, body, inverse_mass, J_start, J_index, J, JM_start, JM_index, JM, dv, dV, y, g)
+    best = y.copy()
     best_residual = 0.0
-    y = np.zeros(m)
-    g = b.copy()
+    value = 0.0
+    for i in range(m):
+        g[i] += b[i]
+        value += 0.5 * y[i] * (g[i] + b[i])
+        best_residual = max(best_residual, scale[i] * abs(min(g[i], y[i])))
     d = np.zeros(m)
     Wd = np.zeros(m)
-    for i in range(m):
-        best_residual = max(best_residual, abs(min(scale[i] * b[i], 0.0)))
     values = np.full(MEMORY, -np.inf)
-    values[0] = 0.0
-    value = 0.0
+    values[0] = value
     step = 1.0
-    products = 0
+    products = 1
     iterations = 0
-    while best_residual > tolerance and iterations < max_iterations:
+    while best_residual > tolerance and iterations < max_iterations and m * products < max_visits:
         iterations += 1
         products += 1
         # The projected spectral step, and W times it.

@@ -29,6 +29,9 @@ from solvers.lcp_gradient import judged
 from solvers.problem import ImpactProblem, Matrix
 from solvers.solution import Floats, ImpactSolution, Status, UnsupportedProblem
 
+# Natural map of a nonnegative least-squares problem with unit rows that counts as solved; rounding leaves 1e-15 of it.
+MINIMAL = 1e-12
+
 
 @dataclass(frozen=True)
 class NewtonLcpNnls:
@@ -194,7 +197,11 @@ def _unit_rows(problem: ImpactProblem) -> Floats:
 
 
 def _least_distance(A: Floats, b: Floats, *, maxiter: int) -> tuple[Floats, bool]:
-    """Multipliers z ≥ 0 of min ½|x|² subject to A x ≥ -b, shape (m,); False where the bound was reached."""
+    """Multipliers z ≥ 0 of min ½|x|² subject to A x ≥ -b, shape (m,); False where the bound was reached.
+
+    `scipy.optimize.nnls` may return what is no minimum, and a residual below the least one (1.17.1: two boxes of balls
+    that push on all walls). What it returns is therefore checked, and the slower `lsq_linear` asked where it fails.
+    """
     E = np.vstack([A.T, -b])
     f = np.zeros(E.shape[0])
     f[-1] = 1.0
@@ -202,6 +209,8 @@ def _least_distance(A: Floats, b: Floats, *, maxiter: int) -> tuple[Floats, bool
         z, _ = scipy.optimize.nnls(E, f, maxiter=maxiter)
     except RuntimeError:
         return np.zeros(b.size), False
+    if np.abs(np.minimum(E.T @ (E @ z - f), z)).max() > MINIMAL:
+        z = np.maximum(scipy.optimize.lsq_linear(E, f, (0.0, np.inf), method="bvls", max_iter=maxiter).x, 0.0)
     remainder = 1.0 + float(b @ z)
     if not remainder > 0:
         return np.zeros(b.size), False

@@ -24,7 +24,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from solvers.compression import ADAPTIVE_CONTACTS, check_settings, integrate_without_gaps
+from solvers.compression import Compliance, integrate_without_gaps
 from solvers.problem import ImpactProblem
 from solvers.solution import ImpactSolution, UnsupportedProblem
 
@@ -34,26 +34,8 @@ SMALLEST_RESTITUTION = 1e-3
 
 
 @dataclass(frozen=True)
-class LiuZhaoBrogliato:
+class LiuZhaoBrogliato(Compliance):
     """Energy-based distribution of impulses, energetic restitution per contact, no friction."""
-
-    exponent: float = 1.5
-    """η of the contact law, ≥ 1: 3/2 is Hertz, 1 a linear spring. Dimensionless."""
-
-    tolerance: float = 1e-12
-    """Error of one step of the adaptive method, relative to the largest speed and compression (small problems)."""
-
-    steps_per_contact: float = 50.0
-    """Leapfrog steps within the shortest contact, all neighbors pressing with it (large problems)."""
-
-    adaptive_contacts: int = ADAPTIVE_CONTACTS
-    """Problems of up to so many contacts are small."""
-
-    max_visits: int = 4_000_000
-    """Bound on contact evaluations, besides 5,000 for each contact."""
-
-    def __post_init__(self) -> None:
-        check_settings(self.exponent, self.tolerance, self.steps_per_contact)
 
     def solve(self, problem: ImpactProblem) -> ImpactSolution:
         """Solve one multi-impact; friction must be 0.
@@ -67,7 +49,4 @@ class LiuZhaoBrogliato:
             raise UnsupportedProblem(
                 f"lzb stores energy and gives e² of it back: restitution must be at least {SMALLEST_RESTITUTION:g}"
             )
-        return integrate_without_gaps(
-            problem, exponent=self.exponent, tolerance=self.tolerance, steps_per_contact=self.steps_per_contact,
-            adaptive_contacts=self.adaptive_contacts, max_visits=self.max_visits,
-        )  # fmt: skip
+        return integrate_without_gaps(problem, self)

@@ -15,7 +15,7 @@ import numpy as np
 
 from solvers import boxed_lcp
 from solvers.problem import ImpactProblem
-from solvers.solution import ImpactSolution, Status
+from solvers.solution import Floats, ImpactSolution, Status
 
 
 @dataclass(frozen=True)
@@ -28,14 +28,35 @@ class NewtonLcp:
     max_iterations: int = 20_000
     """Bound on sweeps over all contacts."""
 
-    def solve(self, problem: ImpactProblem) -> ImpactSolution:
-        """Solve one multi-impact with any restitution and friction per contact."""
-        target = -problem.restitution * problem.u_pre
-        result = boxed_lcp.sweep(problem, target, tolerance=self.tolerance, max_sweeps=self.max_iterations)
-        return lcp_solution(problem, result, self.tolerance)
+    max_visits: int = boxed_lcp.MAX_VISITS
+    """Bound on row visits; the sweep in progress is finished."""
+
+    def solve(
+        self, problem: ImpactProblem, *, start: Floats | None = None, friction_start: Floats | None = None
+    ) -> ImpactSolution:
+        """Solve one multi-impact with any restitution and friction per contact.
+
+        Args:
+            problem: the impact.
+            start: first guess of the normal impulse [N s], shape (m,); a pull counts as 0.
+            friction_start: first guess of the friction impulse [N s], shape (2m,); cut to its bounds.
+
+        Raises:
+            ProblemError: a guess has another shape or is not finite.
+        """
+        result = boxed_lcp.sweep(
+            problem,
+            -problem.restitution * problem.u_pre,
+            tolerance=self.tolerance,
+            max_sweeps=self.max_iterations,
+            max_visits=self.max_visits,
+            start=start,
+            friction_start=friction_start,
+        )
+        return lcp_solution(result, self.tolerance)
 
 
-def lcp_solution(problem: ImpactProblem, result: boxed_lcp.LcpResult, tolerance: float) -> ImpactSolution:
+def lcp_solution(result: boxed_lcp.LcpResult, tolerance: float) -> ImpactSolution:
     """Turn an LCP's result into a solution; its status is what its residual says."""
     if not np.isfinite(result.v).all():
         status = Status.NOT_FINITE
@@ -43,7 +64,7 @@ def lcp_solution(problem: ImpactProblem, result: boxed_lcp.LcpResult, tolerance:
         status = Status.CONVERGED if result.residual <= tolerance else Status.ITERATION_LIMIT
     return ImpactSolution(
         result.impulse,
-        problem.v_after(result.impulse, result.friction_impulse),
+        result.v,
         status,
         result.sweeps,
         result.visits,

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from solvers._jit import kernel
+from solvers.boxed_lcp import MAX_VISITS
 from solvers.problem import ImpactProblem
 from solvers.solution import Floats, ImpactSolution, Status, UnsupportedProblem
 
@@ -31,9 +32,12 @@ class GaussSeidel:
     max_iterations: int = 20_000
     """Bound on passes."""
 
+    max_visits: int = MAX_VISITS
+    """Bound on contact visits."""
+
     def solve(self, problem: ImpactProblem) -> ImpactSolution:
         """Solve one multi-impact; any restitution per contact, no friction."""
-        return _propagate(problem, _gauss_seidel, self.tolerance, self.max_iterations)
+        return _propagate(problem, _gauss_seidel, self.tolerance, self.max_iterations, self.max_visits)
 
 
 @dataclass(frozen=True)
@@ -46,19 +50,30 @@ class Jacobi:
     max_iterations: int = 20_000
     """Bound on passes."""
 
+    max_visits: int = MAX_VISITS
+    """Bound on contact visits."""
+
     def solve(self, problem: ImpactProblem) -> ImpactSolution:
         """Solve one multi-impact; any restitution per contact, no friction."""
-        return _propagate(problem, _jacobi, self.tolerance, self.max_iterations)
+        return _propagate(problem, _jacobi, self.tolerance, self.max_iterations, self.max_visits)
 
 
-def _propagate(problem: ImpactProblem, passes: object, tolerance: float, max_iterations: int) -> ImpactSolution:
-    """Run one of the two kernels and judge what it reached."""
+def _propagate(
+    problem: ImpactProblem, passes: object, tolerance: float, max_iterations: int, max_visits: int
+) -> ImpactSolution:
+    """Run one of the two kernels and judge what it reached.
+
+    The velocity is the one that was carried along: between bodies that are squeezed from both sides the impulses grow
+    without bound, and the difference of their sums loses digits that the velocity itself keeps.
+    """
     if problem.has_friction:
         raise UnsupportedProblem("pairwise propagation has no friction: friction must be 0")
     J, JM = problem.J, problem.JM
+    # The last pass finds nothing, or is followed by none: it is counted beside those that strike.
+    max_passes = max(min(max_iterations, max_visits // max(problem.m, 1) - 1), 0)
     impulse, v, iterations, finite = passes(  # type: ignore[operator]
         J.indptr, J.indices, J.data, JM.indptr, JM.indices, JM.data, problem.W_diagonal, problem.restitution,
-        problem.v_pre, tolerance * problem.speed, max_iterations,
+        problem.v_pre, tolerance * problem.speed, max_passes,
     )  # fmt: skip
     u_min = float((J @ v).min(initial=0.0))
     if not finite:
@@ -67,8 +82,8 @@ def _propagate(problem: ImpactProblem, passes: object, tolerance: float, max_ite
         status = Status.ITERATION_LIMIT
     else:
         status = Status.CONVERGED
-    residual = max(-u_min, 0.0) / (problem.speed or 1.0)
-    return ImpactSolution(impulse, problem.v_after(impulse), status, iterations, problem.m * (iterations + 1), residual)
+    residual = max(0.0, -u_min) / (problem.speed or 1.0)
+    return ImpactSolution(impulse, v, status, iterations, problem.m * (iterations + 1), residual)
 
 
 @kernel

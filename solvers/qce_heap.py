@@ -19,10 +19,12 @@ Indices = npt.NDArray[np.uint32]
 
 # Ends closer than a few rounding errors are one event: symmetric scenes have them always.
 TIE = 8 * np.finfo(np.float64).eps
+# Bound on contact visits where none is given: about a minute on one thread.
+MAX_VISITS = 1_000_000_000
 
 
 def solve_by_heap(
-    problem: ImpactProblem, *, threshold: float, defer: float, max_iterations: int
+    problem: ImpactProblem, *, threshold: float, defer: float, max_iterations: int, max_visits: int = MAX_VISITS
 ) -> tuple[Floats, int, int, bool]:
     """Run QCE's outer iteration.
 
@@ -31,6 +33,7 @@ def solve_by_heap(
         threshold: a contact approaches when u < -threshold [m/s].
         defer: contacts with F_i < defer · max F wait for the next outer iteration; dimensionless.
         max_iterations: bound on outer iterations.
+        max_visits: bound on contact visits; an outer iteration that it interrupts is not applied.
 
     Returns:
         impulse [N s], shape (m,); outer iterations; contact visits; whether it stalled.
@@ -41,7 +44,7 @@ def solve_by_heap(
         JT.indptr, JT.indices,
         JM.indptr, JM.indices.view(np.uint32), JM.data,
         MJT.indptr, MJT.indices.view(np.uint32), MJT.data,
-        problem.v_pre, threshold, defer, max_iterations,
+        problem.v_pre, threshold, defer, max_iterations, max_visits,
     )  # fmt: skip
     return impulse, iterations, visits, stalled
 
@@ -104,7 +107,7 @@ def _solve(
     JT_start: Ints, JT_index: Ints,
     JM_start: Ints, JM_index: Indices, JM: Floats,
     MJT_start: Ints, MJT_index: Indices, MJT: Floats,
-    v_pre: Floats, threshold: float, defer: float, max_iterations: int,
+    v_pre: Floats, threshold: float, defer: float, max_iterations: int, max_visits: int,
 ) -> tuple[Floats, Floats, int, int, bool]:  # fmt: skip
     """Outer iterations on an indexed heap; returns impulse, velocity, iterations, contact visits, stalled."""
     m = J_start.size - 1
@@ -130,7 +133,7 @@ def _solve(
     event = 0
     visits = 0
     iterations = 0
-    while iterations < max_iterations:
+    while iterations < max_iterations and visits < max_visits:
         # What approaches, and how fast.
         F_max = 0.0
         for i in range(m):
@@ -174,7 +177,7 @@ def _solve(
             _sift_down(heap, place, end, position, size)
         # End one contact after the other, earliest first; equal ends are one event.
         stalled = False
-        while size > 0:
+        while size > 0 and visits < max_visits:
             s = end[heap[0]]
             if not s < np.inf:
                 stalled = True
@@ -230,9 +233,9 @@ def _solve(
                 else:
                     _sift_down(heap, place, end, place[i], size)
             visits += touched_count
-        if stalled:
-            # Contacts that never end would leave work behind: this iteration is not applied.
-            return impulse, velocity, iterations, visits, True
+        if size > 0:
+            # Contacts that never end, or have not yet, would leave work behind: this iteration is not applied.
+            return impulse, velocity, iterations, visits, stalled
         for d in range(n):
             dv = 0.0
             for q in range(MJT_start[d], MJT_start[d + 1]):

@@ -45,20 +45,56 @@ class QceLcp:
     max_sweeps: int = 20_000
     """Bound on the sweeps of the LCP."""
 
-    def solve(self, problem: ImpactProblem) -> ImpactSolution:
-        """Solve one multi-impact with any restitution and friction per contact."""
+    max_visits: int = boxed_lcp.MAX_VISITS
+    """Bound on the contact visits of the QCE step, and on the row visits of the LCP."""
+
+    def solve(
+        self, problem: ImpactProblem, *, start: Floats | None = None, friction_start: Floats | None = None
+    ) -> ImpactSolution:
+        """Solve one multi-impact with any restitution and friction per contact.
+
+        Args:
+            problem: the impact.
+            start: first guess of the normal impulse [N s], shape (m,), for the LCP; a pull counts as 0.
+            friction_start: first guess of the friction impulse [N s], shape (2m,); cut to its bounds.
+
+        Raises:
+            ProblemError: a guess has another shape or is not finite.
+            UnsupportedProblem: bodies have too many contacts for the frictionless LCP.
+        """
         target = np.zeros(problem.m)
         elastic = None
         if problem.restitution.any():
             elastic = solve_elastic(
-                problem, defer=0.0, tolerance=self.qce_tolerance, max_iterations=self.max_iterations
+                problem,
+                defer=0.0,
+                tolerance=self.qce_tolerance,
+                max_iterations=self.max_iterations,
+                max_visits=self.max_visits,
             )
             if not problem.has_friction and (problem.restitution == 1.0).all():
                 return elastic
             target = problem.restitution * (problem.J @ elastic.v_post)
-        solve = boxed_lcp.sweep if problem.has_friction else boxed_lcp.project
-        result = solve(problem, target, tolerance=self.tolerance, max_sweeps=self.max_sweeps)
-        return _joined(lcp_solution(problem, result, self.tolerance), elastic)
+        if problem.has_friction:
+            result = boxed_lcp.sweep(
+                problem,
+                target,
+                tolerance=self.tolerance,
+                max_sweeps=self.max_sweeps,
+                max_visits=self.max_visits,
+                start=start,
+                friction_start=friction_start,
+            )
+        else:
+            result = boxed_lcp.project(
+                problem,
+                target,
+                tolerance=self.tolerance,
+                max_sweeps=self.max_sweeps,
+                max_visits=self.max_visits,
+                start=start,
+            )
+        return _joined(lcp_solution(result, self.tolerance), elastic)
 
 
 @dataclass(frozen=True)
@@ -77,6 +113,9 @@ class QceBlend:
     max_sweeps: int = 20_000
     """Bound on the sweeps of the LCPs together."""
 
+    max_visits: int = boxed_lcp.MAX_VISITS
+    """Bound on the contact visits of the QCE step, and on the row visits of the LCPs together."""
+
     def solve(self, problem: ImpactProblem) -> ImpactSolution:
         """Solve one multi-impact.
 
@@ -88,7 +127,11 @@ class QceBlend:
         elastic_impulse = np.zeros(problem.m)
         if restitution > 0.0:
             elastic = solve_elastic(
-                problem, defer=0.0, tolerance=self.qce_tolerance, max_iterations=self.max_iterations
+                problem,
+                defer=0.0,
+                tolerance=self.qce_tolerance,
+                max_iterations=self.max_iterations,
+                max_visits=self.max_visits,
             )
             assert elastic.impulse is not None
             elastic_impulse = elastic.impulse
@@ -104,7 +147,12 @@ class QceBlend:
         sweeps = visits = 0
         while True:
             plastic = boxed_lcp.project(
-                problem, rest, v_start=v_start, tolerance=self.tolerance, max_sweeps=self.max_sweeps
+                problem,
+                rest,
+                v_start=v_start,
+                tolerance=self.tolerance,
+                max_sweeps=self.max_sweeps,
+                max_visits=self.max_visits,
             )
             impulse = (1.0 - restitution) * plastic.impulse + restitution * elastic_impulse
             sweeps += plastic.sweeps
@@ -112,17 +160,20 @@ class QceBlend:
             residual = plastic.residual
             if not problem.has_friction:
                 break
-            friction = boxed_lcp.dissipate(problem, impulse, tolerance=self.tolerance, max_sweeps=self.max_sweeps)
+            friction = boxed_lcp.dissipate(
+                problem, impulse, tolerance=self.tolerance, max_sweeps=self.max_sweeps, max_visits=self.max_visits
+            )
             friction_impulse = friction.friction_impulse
             sweeps += friction.sweeps
             visits += friction.visits
             v_before, v_start = v_start, problem.v_after(rest, friction_impulse)
             change = float(np.abs(problem.J @ (v_start - v_before)).max(initial=0.0)) / (problem.speed or 1.0)
             residual = max(residual, friction.residual, change)
-            if change <= self.tolerance or sweeps >= self.max_sweeps:
+            if change <= self.tolerance or sweeps >= self.max_sweeps or visits >= self.max_visits:
                 break
-        result = boxed_lcp.LcpResult(impulse, friction_impulse, v_start, sweeps, visits, residual)
-        solution = lcp_solution(problem, result, self.tolerance)
+        v = problem.v_after(impulse, friction_impulse)
+        result = boxed_lcp.LcpResult(impulse, friction_impulse, v, sweeps, visits, residual)
+        solution = lcp_solution(result, self.tolerance)
         if solution.status is Status.CONVERGED and problem.has_friction:
             # Friction moves the normal velocities of QCE's share, which nothing pushes back.
             u_min = float((problem.J @ solution.v_post).min(initial=0.0))

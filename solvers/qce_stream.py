@@ -1,4 +1,4 @@
-"""QCE for many contacts: the ends of one outer iteration as a causal fixed point, streamed in batches.
+"""QCE for many contacts: the ends of one outer iteration as a causal fixed point, streamed in tiles.
 
     e_i(s) = u_i s + ½ Σ_j W_ij F_j [s² - (s - s_j)₊²] = 0      s_i is its first upward crossing
 
@@ -6,12 +6,22 @@ Only neighbors with s_j < s_i matter to contact i, hence the ends are unique and
 until nothing changes gives what `qce_heap` gives, which pops the earliest end first. The speed comes from
 
 - the order: contacts are sorted, coarsely, by the end that they would have if no neighbor ended before them. Most are
-  then evaluated after all that they depend on: about 1.15 evaluations an end instead of 1.7 in storage order;
-- batches: contacts with equally many neighbors are evaluated together, one operation on all of a batch at a time, so
-  that the compiler makes vector instructions of it and no branch is mispredicted;
+  then evaluated after all that they depend on: 1.16 (3,000 contacts) to 1.26 (183,000) evaluations an end;
+- one root: with the neighbors that end before it known, the end is the root of one quadratic about s = 0,
+
+      ½ A s² + (B - F) s - ½ C = 0,   A = Σ_late c_j,  B = Σ_early c_j s_j,  C = Σ_early c_j s_j²,   c_j = W_ij F_j
+
+  It is the end if all early neighbors end before it, all late ones after it, and nothing crosses zero earlier. That
+  holds if e(s)/s lies below a rising line through its root: e(s)/s + F = Σ c_j φ_j(s) with φ_j = s/2 up to s_j and
+  s_j - s_j²/(2 s) after it, increasing and concave; the tangent of φ_j at the root where c_j > 0 and its chord from 0
+  where c_j < 0 make the line, and its slope is positive if
+
+      A s² + Σ_{c_j > 0} c_j s_j² + Σ_{c_j < 0} c_j (2 s s_j - s_j²) > 0        (sums over early neighbors)
+
+  82 to 90 % of the evaluations pass (sphere packs); the others go through time piece by piece, as the heap does;
 - no heap, no W: only the couplings of contacts that are active together, for one outer iteration.
 
-No slope is updated by subtraction: in each piece of time the couplings of all neighbors still active are summed anew
+No slope is updated by subtraction: the couplings of all neighbors still active are summed anew in each evaluation
 (see `quadratic_contact_energy`). One thread, no random numbers, no dependence on memory addresses: the same input gives
 the same bits.
 
@@ -25,6 +35,7 @@ import numpy.typing as npt
 
 from solvers._jit import kernel
 from solvers.problem import ImpactProblem
+from solvers.qce_heap import MAX_VISITS
 from solvers.solution import Floats
 from solvers.sphere_rows import SphereRows
 
@@ -35,22 +46,19 @@ Flags = npt.NDArray[np.uint8]
 
 # Ends that differ by a few rounding errors are one: symmetric scenes have them always, and each would wake the other.
 TIE = 8 * float(np.finfo(np.float64).eps)
-INF = float(np.inf)
-
-# Contacts of one batch: eight vectors of four; more did not help.
-LANES = 32
-# A smaller batch costs more than its contacts one by one.
-FEWEST_LANES = 8
-# Batches exist for up to so many neighbors; a contact with more is evaluated alone.
-MOST_NEIGHBORS = 24
-# Rows of LANES numbers in a batch's memory: the state of each contact, then (end, coupling) of each neighbor.
-TIME, WORK, SPEED, SLOPE, NEXT, END, BASE, BEFORE, NEIGHBORS = (row * LANES for row in range(9))
-BATCH = NEIGHBORS + 2 * MOST_NEIGHBORS * LANES
+# End of a contact that was not evaluated yet, and of one that does not end as long as none of its neighbors does.
+PENDING = float(np.inf)
+NEVER = float(np.finfo(np.float64).max)
 # Sorting keys are the leading bits of a float: its exponent and four bits of its mantissa, 16 keys an octave.
 KEY_BITS = 48
 KEYS = 512
-# The contacts are sorted in tiles of so many, which fit in the second-level cache with all that they touch.
-TILE = 4096
+# The contacts are sorted and evaluated in tiles of so many, which fit in the second-level cache with their couplings.
+# Smaller ones cost more evaluations, as neighbors in a later tile are not known: 1.37 an end with 4,096, 1.26 with
+# 8,192, 1.21 with 16,384 (kick, 183,000 contacts).
+TILE = 8192
+# Sweeps of a tile before the next is begun. Without the ends in later tiles two contacts can push each other's end on
+# for ever; with all of them, only a contact that never ends does.
+TILE_SWEEPS = 4
 # Where fewer than one contact in so many was active, only their neighborhood is searched for approaching contacts.
 SEARCH_ALL = 24
 # Rounding can make tied contacts wake each other for ever; no problem met here needed 100 sweeps beyond its contacts.
@@ -61,284 +69,152 @@ RESTLESS = 2
 
 
 def solve_spheres(
-    rows: SphereRows, *, threshold: float, defer: float, max_iterations: int
+    rows: SphereRows, *, threshold: float, defer: float, max_iterations: int, max_visits: int = MAX_VISITS
 ) -> tuple[Floats, int, int, int]:
-    """Run QCE's outer iteration on packed contacts (`rows.V` is changed).
+    """Run QCE's outer iteration on packed contacts; `rows.V` is left at the velocities that it reaches.
+
+    Args:
+        rows: contacts, bodies and velocities.
+        threshold: a contact approaches when u < -threshold [m/s].
+        defer: contacts with F_i < defer · max F wait for the next outer iteration; dimensionless.
+        max_iterations: bound on outer iterations.
+        max_visits: bound on contact visits; the outer iteration in progress is finished.
 
     Returns:
         impulse [N s] in the order of `rows`, shape (m,); outer iterations; contact visits; 0, STALLED or RESTLESS.
     """
-    return _solve_spheres(rows.normal, rows.body, rows.V, threshold, defer, max_iterations)
+    return _solve_spheres(rows.normal, rows.body, rows.V, threshold, defer, max_iterations, max_visits)
+
+
+def largest_approach(rows: SphereRows) -> float:
+    """Largest -u of packed contacts [m/s], at least 0."""
+    return _largest_approach(rows.normal, rows.body, rows.V)
 
 
 def solve_sparse(
-    problem: ImpactProblem, *, threshold: float, defer: float, max_iterations: int
+    problem: ImpactProblem, *, threshold: float, defer: float, max_iterations: int, max_visits: int = MAX_VISITS
 ) -> tuple[Floats, int, int, int]:
-    """Run QCE's outer iteration on the sparse matrices of any problem; returns as `solve_spheres`."""
+    """Run QCE's outer iteration on the sparse matrices of any problem; arguments and result as in `solve_spheres`."""
     J, JM = problem.J, problem.JM
     return _solve_sparse(
-        J.indptr,
-        J.indices.view(np.uint32),
-        J.data,
-        JM.indptr,
-        JM.indices.view(np.uint32),
-        JM.data,
-        problem.v_pre,
-        threshold,
-        defer,
-        max_iterations,
-    )
+        J.indptr, J.indices.view(np.uint32), J.data, JM.indptr, JM.indices.view(np.uint32), JM.data,
+        problem.v_pre, threshold, defer, max_iterations, max_visits,
+    )  # fmt: skip
 
 
 @kernel
-def _first_end(e: float, v: float, w: float) -> float:
-    """First t ≥ 0 at which e + v t + ½ w t² crosses zero upward; inf where it never does."""
-    discriminant = v * v - 2.0 * w * e
-    root = np.sqrt(discriminant if discriminant > 0.0 else 0.0)
-    q = abs(v) + root
-    # v > 0: -2 e / (v + √), for either sign of w; v ≤ 0: (-v + √) / w, for w > 0 alone.
-    numerator = -2.0 * e if v > 0.0 else q
-    denominator = q if v > 0.0 else w
-    never = -discriminant if v > 0.0 else (-w if w != 0.0 else 1.0)
-    t = numerator / denominator
-    # Rounding may leave e slightly above zero: the contact ends now.
-    t = t if t > 0.0 else 0.0
-    return INF if never > 0.0 else t
-
-
-@kernel
-def _end_alone(
-    i: int, neighbors: int, F: Floats, base: Floats, start: Ints, neighbor: Indices, coupling: Floats, end: Floats
+def _end_by_pieces(
+    F: float, own: float, begin: int, stop: int, neighbor: Indices, coupling: Floats, end: Floats
 ) -> float:
-    """End of one contact, given those of its first so many neighbors; the same operations as in a batch."""
+    """End of one contact, through the pieces of time between the ends of its neighbors."""
     now = 0.0
     e = 0.0
-    v = -F[i]
+    v = -F
     while True:
-        w = base[i]
-        following = INF
-        for q in range(start[i], start[i] + neighbors):
+        # The slope in the piece from `now` to the next end of a neighbor.
+        w = own
+        following = NEVER
+        for q in range(begin, stop):
             s = end[neighbor[q]]
-            if s > now:
-                w += coupling[q]
-                following = min(following, s)
+            c = coupling[q]
+            w += c if s > now else 0.0
+            s = s if s > now else NEVER
+            following = s if s < following else following
         t = following - now
-        first = _first_end(e, v, w)
-        if first <= t or following == INF:
-            return now + first
-        e += (v + 0.5 * w * t) * t
+        last = following >= NEVER
+        e_following = 0.0 if last else e + (v + 0.5 * w * t) * t
+        # It may end in this piece: e is above zero at the end of it, or has a maximum within.
+        if e_following >= 0.0 or (v > 0.0 and w < 0.0):
+            discriminant = v * v - 2.0 * w * e
+            first = PENDING
+            if v > 0.0 and discriminant >= 0.0:
+                # Rounding may leave e slightly above zero: the contact ends now.
+                first = max(-2.0 * e / (v + np.sqrt(discriminant)), 0.0)
+            elif v <= 0.0 and w > 0.0:
+                first = max(np.sqrt(max(discriminant, 0.0)) - v, 0.0) / w
+            if first <= t:
+                return now + first
+            if last:
+                return NEVER
+        e = e_following
         v += w * t
         now = following
 
 
 @kernel
-def _evaluate_alone(
-    i: int, neighbors: int, F: Floats, base: Floats,
-    start: Ints, neighbor: Indices, coupling: Floats, end: Floats, awake: Flags,
-) -> None:  # fmt: skip
-    """Evaluate one contact, and wake what depended on its end if that changed."""
-    awake[i] = 0
-    s = _end_alone(i, neighbors, F, base, start, neighbor, coupling, end)
-    before = end[i]
-    earlier = min(s, before)
-    if not (s == before or abs(s - before) <= TIE * earlier):
-        end[i] = s
-        for q in range(start[i], start[i + 1]):
-            j = neighbor[q]
-            awake[j] |= end[j] > earlier
-    overlooked = False
-    for q in range(start[i] + neighbors, start[i + 1]):
-        overlooked |= end[neighbor[q]] < end[i]
-    awake[i] |= overlooked
-
-
-@kernel
-def _advance(batch: Floats, neighbors: int) -> None:
-    """Ends of a batch of contacts with so many neighbors each: every loop over lanes is one vector operation."""
-    for _ in range(neighbors + 1):
-        # The piece of time from `now` to the next end of a neighbor, and the slope in it.
-        for lane in range(LANES):
-            batch[SLOPE + lane] = batch[BASE + lane]
-            batch[NEXT + lane] = INF
-        for d in range(neighbors):
-            row = NEIGHBORS + 2 * d * LANES
-            for lane in range(LANES):
-                s = batch[row + lane]
-                c = batch[row + LANES + lane]
-                following = batch[NEXT + lane]
-                live = s > batch[TIME + lane]
-                s = s if live else INF
-                batch[SLOPE + lane] += c if live else 0.0
-                batch[NEXT + lane] = s if s < following else following
-        # `_first_end`, written out: a call would keep the loop from becoming vector instructions.
-        for lane in range(LANES):
-            now = batch[TIME + lane]
-            e = batch[WORK + lane]
-            v = batch[SPEED + lane]
-            w = batch[SLOPE + lane]
-            following = batch[NEXT + lane]
-            before = batch[END + lane]
-            discriminant = v * v - 2.0 * w * e
-            root = np.sqrt(discriminant if discriminant > 0.0 else 0.0)
-            q = abs(v) + root
-            numerator = -2.0 * e if v > 0.0 else q
-            denominator = q if v > 0.0 else w
-            never = -discriminant if v > 0.0 else (-w if w != 0.0 else 1.0)
-            first = numerator / denominator
-            first = first if first > 0.0 else 0.0
-            first = INF if never > 0.0 else first
-            t = following - now
-            s = now + first if first <= t else INF
-            batch[END + lane] = s if s < before else before
-            batch[WORK + lane] = e + (v + 0.5 * w * t) * t
-            batch[SPEED + lane] = v + w * t
-            batch[TIME + lane] = following
-        going = 0
-        for lane in range(LANES):
-            going += 1 if (batch[END + lane] == INF and batch[TIME + lane] < INF) else 0
-        if going == 0:
-            break
-
-
-@kernel
-def _flush(
-    batch: Floats, queue: Indices, neighbors: int, count: int, F: Floats, base: Floats,
-    start: Ints, neighbor: Indices, coupling: Floats, end: Floats, awake: Flags,
-) -> None:  # fmt: skip
-    """Evaluate the queued contacts with so many neighbors, and wake what depended on the ends that changed."""
-    head = neighbors * LANES
-    if count < FEWEST_LANES:
-        for lane in range(count):
-            _evaluate_alone(queue[head + lane], neighbors, F, base, start, neighbor, coupling, end, awake)
-        return
-    for lane in range(count):
-        i = queue[head + lane]
-        awake[i] = 0
-        batch[TIME + lane] = 0.0
-        batch[WORK + lane] = 0.0
-        batch[SPEED + lane] = -F[i]
-        batch[END + lane] = INF
-        batch[BASE + lane] = base[i]
-        batch[BEFORE + lane] = end[i]
-        q = start[i]
-        for d in range(neighbors):
-            row = NEIGHBORS + 2 * d * LANES
-            batch[row + lane] = end[neighbor[q + d]]
-            batch[row + LANES + lane] = coupling[q + d]
-    for lane in range(count, LANES):
-        batch[END + lane] = 0.0
-        batch[TIME + lane] = INF
-    _advance(batch, neighbors)
-    # All ends first: whether a contact of the same batch must wake depends on its new end.
-    for lane in range(count):
-        s = batch[END + lane]
-        before = batch[BEFORE + lane]
-        earlier = s if s < before else before
-        same = s == before or abs(s - before) <= TIE * earlier
-        end[queue[head + lane]] = before if same else s
-        batch[BEFORE + lane] = INF if same else earlier
-    for lane in range(count):
-        i = queue[head + lane]
-        earlier = batch[BEFORE + lane]
-        q_looked = start[i] + neighbors
-        for q in range(start[i], q_looked):
-            j = neighbor[q]
-            awake[j] |= end[j] > earlier
-        # Neighbors after it in the order may have been evaluated before it: batches fill at different times.
-        overlooked = False
-        for q in range(q_looked, start[i + 1]):
-            j = neighbor[q]
-            awake[j] |= end[j] > earlier
-            overlooked |= end[j] < end[i]
-        awake[i] |= overlooked
-
-
-@kernel
-def _first_sweep(
-    begin: int, stop: int, order: Indices, F: Floats, base: Floats, start: Ints, middle: Ints,
-    neighbor: Indices, coupling: Floats, end: Floats, awake: Flags,
-    batch: Floats, queue: Indices, waiting: Ints,
-) -> None:  # fmt: skip
-    """Evaluate some active contacts in their likely order, with the neighbors that likely end before them alone.
-
-    Those stand between `start` and `middle`; the couplings of the others are in `base`, as if they never ended.
-    Contacts may be left waiting for their batch to fill.
-    """
-    for k in range(begin, stop):
-        i = order[k]
-        neighbors = middle[i] - start[i]
-        if neighbors < MOST_NEIGHBORS:
-            waits = waiting[neighbors]
-            queue[neighbors * LANES + waits] = i
-            waiting[neighbors] = waits + 1
-            if waits + 1 == LANES:
-                waiting[neighbors] = 0
-                _flush(batch, queue, neighbors, LANES, F, base, start, neighbor, coupling, end, awake)
-        else:
-            _evaluate_alone(i, neighbors, F, base, start, neighbor, coupling, end, awake)
-
-
-@kernel
-def _later_sweeps(
-    size: int, F: Floats, own: Floats, base: Floats, start: Ints,
-    neighbor: Indices, coupling: Floats, end: Floats, awake: Flags,
-    batch: Floats, queue: Indices, waiting: Ints,
+def _sweep(
+    size: int, order: Indices, F: Floats, own: Floats, start: Ints, neighbor: Indices, coupling: Floats,
+    end: Floats, awake: Flags, woken: Indices,
 ) -> int:  # fmt: skip
-    """Evaluate what waits and what was woken, with all neighbors, until nothing changes.
-
-    Returns:
-        evaluations, or -1 where no fixed point was found.
-    """
-    for neighbors in range(MOST_NEIGHBORS):
-        if waiting[neighbors] > 0:
-            count = waiting[neighbors]
-            waiting[neighbors] = 0
-            _flush(batch, queue, neighbors, count, F, base, start, neighbor, coupling, end, awake)
-    evaluations = 0
-    for _ in range(size + SPARE_SWEEPS):
-        woken = 0
-        for i in range(size):
-            if awake[i] == 0:
-                continue
-            woken += 1
-            neighbors = start[i + 1] - start[i]
-            if neighbors < MOST_NEIGHBORS:
-                waits = waiting[neighbors]
-                queue[neighbors * LANES + waits] = i
-                waiting[neighbors] = waits + 1
-                if waits + 1 == LANES:
-                    waiting[neighbors] = 0
-                    _flush(batch, queue, neighbors, LANES, F, own, start, neighbor, coupling, end, awake)
-            else:
-                _evaluate_alone(i, neighbors, F, own, start, neighbor, coupling, end, awake)
-        for neighbors in range(MOST_NEIGHBORS):
-            if waiting[neighbors] > 0:
-                count = waiting[neighbors]
-                waiting[neighbors] = 0
-                _flush(batch, queue, neighbors, count, F, own, start, neighbor, coupling, end, awake)
-        evaluations += woken
-        if woken == 0:
-            return evaluations
-    return -1
+    """Evaluate the listed contacts; lists those that were evaluated before and must be again, and returns how many."""
+    count = 0
+    for p in range(size):
+        k = order[p]
+        before = end[k]
+        # Early neighbors are those evaluated already that end before this one did, if it was itself evaluated.
+        limit = min(before, NEVER)
+        A = own[k]
+        B = C = B_pull = C_pull = 0.0
+        latest = 0.0
+        following = PENDING
+        # Selections, no branches: they would be mispredicted half of the time.
+        for q in range(start[k], start[k + 1]):
+            c = coupling[q]
+            s_j = end[neighbor[q]]
+            early = s_j < limit
+            t = s_j if early else 0.0
+            A += 0.0 if early else c
+            b = c * t
+            B += b
+            C += b * t
+            pull = min(b, 0.0)
+            B_pull += pull
+            C_pull += pull * t
+            latest = t if t > latest else latest
+            late = PENDING if early else s_j
+            following = late if late < following else following
+        # The root of the quadratic, without cancellation; 0 where it has none, which is refused.
+        v = B - F[k]
+        discriminant = v * v + A * C
+        sum_of_roots = abs(v) + np.sqrt(max(discriminant, 0.0))
+        denominator = sum_of_roots if v > 0.0 else A
+        s = (C if v > 0.0 else sum_of_roots) / denominator if denominator > 0.0 else 0.0
+        rising = A * s * s + 2.0 * s * B_pull + (C - 2.0 * C_pull)
+        if not (discriminant >= 0.0 and rising > 0.0 and latest <= s and s <= following):
+            s = _end_by_pieces(F[k], own[k], start[k], start[k + 1], neighbor, coupling, end)
+        awake[k] = 0
+        earlier = min(s, before)
+        if s == before or abs(s - before) <= TIE * earlier:
+            continue
+        end[k] = s
+        # What ends after it and did not know this end.
+        if latest > earlier or following < PENDING:
+            for q in range(start[k], start[k + 1]):
+                j = neighbor[q]
+                if earlier < end[j] and end[j] < PENDING and awake[j] == 0:
+                    awake[j] = 1
+                    woken[count] = j
+                    count += 1
+    return count
 
 
 @kernel
-def _sort(begin: int, stop: int, guess: Floats, key: Ints, first: Ints, order: Indices) -> None:
-    """Counting sort of some active contacts by their likely end; equal keys keep their order."""
+def _sort(begin: int, stop: int, guess: Floats, key: Ints, first: Ints, order: Indices, listed: int) -> None:
+    """Counting sort of some active contacts by their likely end, behind those listed; equal keys keep their order."""
     bits = guess.view(np.int64)
     total = 0
     finite = 0
     for k in range(begin, stop):
         key[k] = bits[k] >> KEY_BITS
-        if guess[k] < INF:
+        if guess[k] < NEVER:
             total += key[k]
             finite += 1
     lowest = total // max(finite, 1) - KEYS // 2
     first[:] = 0
+    first[0] = listed
     for k in range(begin, stop):
         key[k] = min(max(key[k] - lowest, 0), KEYS - 1)
         first[key[k] + 1] += 1
-    first[0] = begin
     for c in range(KEYS):
         first[c + 1] += first[c]
     for k in range(begin, stop):
@@ -348,31 +224,33 @@ def _sort(begin: int, stop: int, guess: Floats, key: Ints, first: Ints, order: I
 
 
 @kernel
-def _contacts_of_bodies(body: Indices, bodies: int) -> tuple[Ints, Ints]:
-    """Contacts of each body, CSR."""
-    first = np.zeros(bodies + 2, np.int32)
-    for i in range(body.shape[0]):
-        first[body[i, 0] + 2] += 1
-        first[body[i, 1] + 2] += 1
-    for b in range(2, bodies + 2):
-        first[b] += first[b - 1]
-    contact = np.empty(2 * body.shape[0], np.int32)
-    for i in range(body.shape[0]):
-        for side in range(2):
-            b = body[i, side] + 1
-            contact[first[b]] = i
-            first[b] += 1
-    return first, contact
+def _settle(
+    begin: int, stop: int, size: int, left: int, F: Floats, own: Floats, slope: Floats, start: Ints,
+    neighbor: Indices, coupling: Floats, end: Floats, awake: Flags, order: Indices, woken: Indices,
+    key: Ints, first_key: Ints,
+) -> tuple[int, int]:  # fmt: skip
+    """Evaluate a tile and what others left over (the first entries of `order`); the last tile, until nothing changes.
 
+    `slope` is Σ_j W_ij F_j over all neighbors; what is left in it is half of the end if none of them ended first.
 
-@kernel
-def _closing(normal: Floats, body: Indices, V: Floats, i: int) -> float:
-    """Approach velocity -u of one contact."""
-    a = body[i, 0]
-    b = body[i, 1]
-    return -float(
-        normal[i, 0] * (V[b, 0] - V[a, 0]) + normal[i, 1] * (V[b, 1] - V[a, 1]) + normal[i, 2] * (V[b, 2] - V[a, 2])
-    )
+    Returns:
+        evaluations, and how many contacts are left over in `order`: after the last tile, 0 if a fixed point was found.
+    """
+    for k in range(begin, stop):
+        slope[k] = F[k] / slope[k] if slope[k] > 0.0 else NEVER
+    _sort(begin, stop, slope, key, first_key, order, left)
+    left += stop - begin
+    evaluations = 0
+    due = order
+    for _ in range(TILE_SWEEPS if stop < size else size + SPARE_SWEEPS):
+        evaluations += left
+        left = _sweep(left, due, F, own, start, neighbor, coupling, end, awake, woken)
+        due, woken = woken, due
+        if left == 0:
+            break
+    for p in range(left):
+        order[p] = due[p]
+    return evaluations, left
 
 
 @kernel
@@ -391,261 +269,427 @@ def _keep_fast(size: int, active: Indices, F: Floats, defer: float) -> int:
 
 
 @kernel
-def _solve_spheres(
-    normal: Floats, body: Indices, V: Floats, threshold: float, defer: float, max_iterations: int
-) -> tuple[Floats, int, int, int]:
-    """Outer iterations on packed contacts (V is changed)."""
-    m = normal.shape[0]
-    bodies = V.shape[0] - 1
-    impulse = np.zeros(m)
-    found = np.empty(m + 1, np.uint32)
-    F = np.empty(m + 1)
-    # Per body: how many active contacts, where their records begin, and Σ F n.
-    count = np.zeros(bodies + 1, np.int32)
-    first = np.zeros(bodies + 1, np.int32)
-    force = np.zeros((bodies + 1, 3))
-    touched = np.empty(bodies + 1, np.uint32)
-    touched_count = 0
-    # What only a search by neighborhood needs.
-    first_contact = np.empty(0, np.int32)
-    contact_of = np.empty(0, np.int32)
-    seen = np.empty(0, np.int32)
-    # Per active contact; made larger where an iteration needs it.
-    room = 0
-    guess = np.empty(0)
-    key = np.empty(0, np.int32)
-    order = np.empty(0, np.uint32)
-    own = np.empty(0)
-    base = np.empty(0)
-    end = np.empty(0)
-    awake = np.empty(0, np.uint8)
-    start = np.empty(0, np.int32)
-    middle = np.empty(0, np.int32)
-    record = np.empty((0, 4))
-    record_of = np.empty(0, np.uint32)
-    neighbor = np.empty(0, np.uint32)
-    coupling = np.empty(0)
-    first_key = np.empty(KEYS + 1, np.int32)
-    batch = np.zeros(BATCH)
-    queue = np.zeros(MOST_NEIGHBORS * LANES, np.uint32)
-    waiting = np.zeros(MOST_NEIGHBORS, np.int32)
-    visits = 0
-    iterations = 0
-    everywhere = True
-    while iterations < max_iterations:
-        # What approaches, and how fast.
-        size = 0
-        if everywhere:
-            # No branch here: one contact in five approaches, at random.
-            for i in range(m):
-                F_i = _closing(normal, body, V, i)
+def _all_end(size: int, end: Floats) -> bool:
+    """False where a contact never ends: it would leave work behind, and the outer iteration is not applied."""
+    ended = 0
+    for k in range(size):
+        ended += end[k] < NEVER
+    return ended == size
+
+
+@kernel
+def _approach(normal: Floats, body: Indices, V: Floats, i: int) -> float:
+    """Approach velocity -u of one contact."""
+    a = body[i, 0]
+    b = body[i, 1]
+    return -float(
+        normal[i, 0] * (V[b, 0] - V[a, 0]) + normal[i, 1] * (V[b, 1] - V[a, 1]) + normal[i, 2] * (V[b, 2] - V[a, 2])
+    )
+
+
+@kernel
+def _largest_approach(normal: Floats, body: Indices, V: Floats) -> float:
+    """Largest approach velocity of all contacts, at least 0."""
+    largest = 0.0
+    for i in range(body.shape[0]):
+        largest = max(largest, _approach(normal, body, V, i))
+    return largest
+
+
+@kernel
+def _search(normal: Floats, body: Indices, V: Floats, threshold: float, found: Indices, F: Floats) -> int:
+    """List the contacts that approach, and how fast; returns how many."""
+    size = 0
+    # No branch here: one contact in five approaches, at random.
+    for i in range(body.shape[0]):
+        F_i = _approach(normal, body, V, i)
+        found[size] = i
+        F[size] = F_i
+        size += F_i > threshold
+    return size
+
+
+@kernel
+def _search_nearby(
+    normal: Floats, body: Indices, V: Floats, threshold: float, found: Indices, F: Floats,
+    moved: int, pair: Indices, span: Indices, contact_of: Indices, seen: Ints, iteration: int,
+) -> tuple[int, int]:  # fmt: skip
+    """Search around the bodies that the last outer iteration moved; returns how many approach and were looked at."""
+    size = 0
+    looked = 0
+    for k in range(moved):
+        for side in range(2):
+            b = pair[k, side]
+            if not V[b, 3] > 0.0:
+                continue
+            for q in range(span[b, 0], span[b + 1, 0]):
+                i = contact_of[q]
+                if seen[i] == iteration:
+                    continue
+                seen[i] = iteration
+                looked += 1
+                F_i = _approach(normal, body, V, i)
                 found[size] = i
                 F[size] = F_i
                 size += F_i > threshold
+    return size, looked
+
+
+@kernel
+def _spans(body: Indices, bodies: int) -> Indices:
+    """Where the contacts of each body begin in an array of all, and 0: how many of them are active."""
+    span = np.zeros((bodies, 2), np.uint32)
+    for i in range(body.shape[0]):
+        span[body[i, 0], 0] += 1
+        span[body[i, 1], 0] += 1
+    total = 0
+    for b in range(bodies):
+        count = span[b, 0]
+        span[b, 0] = total
+        total += count
+    return span
+
+
+@kernel
+def _contacts_of_bodies(body: Indices, span: Indices) -> Indices:
+    """Contacts of each body, from where its span begins."""
+    contact_of = np.empty(2 * body.shape[0], np.uint32)
+    count = np.zeros(span.shape[0], np.uint32)
+    for i in range(body.shape[0]):
+        for side in range(2):
+            b = body[i, side]
+            contact_of[span[b, 0] + count[b]] = i
+            count[b] += 1
+    return contact_of
+
+
+@kernel
+def _enlist(
+    size: int, found: Indices, F: Floats, normal: Floats, body: Indices, V: Floats, span: Indices,
+    member: Indices, n: Floats, pair: Indices, own: Floats, slope: Floats, end: Floats, awake: Flags,
+) -> None:  # fmt: skip
+    """Pack the active contacts, and list them (twice their number, plus their side) with each movable body."""
+    for k in range(size):
+        i = found[k]
+        inverse_mass = 0.0
+        for side in range(2):
+            b = body[i, side]
+            pair[k, side] = b
+            count = span[b, 1]
+            member[span[b, 0] + count] = 2 * k + side
+            span[b, 1] = count + (V[b, 3] > 0.0)
+            inverse_mass += V[b, 3]
+        x, y, z = normal[i, 0], normal[i, 1], normal[i, 2]
+        n[k, 0], n[k, 1], n[k, 2] = x, y, z
+        own[k] = (x * x + y * y + z * z) * inverse_mass * F[k]
+        slope[k] = own[k]
+        end[k] = PENDING
+        awake[k] = 1
+
+
+@kernel
+def _lay_out(
+    size: int, pair: Indices, V: Floats, span: Indices, member: Indices, start: Ints, fill: Ints,
+    shared: Indices, reach: Ints,
+) -> int:  # fmt: skip
+    """Where each contact's couplings begin, and the bodies with several active contacts; returns how many couplings.
+
+    Bodies are listed in the order of their first contact, and `reach` says how many each tile has, with all before.
+    """
+    row = 0
+    count = 0
+    for tile in range((size - 1) // TILE + 1):
+        for k in range(tile * TILE, min(tile * TILE + TILE, size)):
+            start[k] = row
+            fill[k] = row
+            for side in range(2):
+                b = pair[k, side]
+                others = span[b, 1] - (1 if V[b, 3] > 0.0 else 0)
+                row += others
+                shared[count] = b
+                count += (others > 0) & (member[span[b, 0]] >> 1 == k)
+        reach[tile] = count
+    start[size] = row
+    return row
+
+
+@kernel
+def _couple(
+    begin: int, stop: int, shared: Indices, F: Floats, n: Floats, V: Floats, span: Indices, member: Indices,
+    near: Floats, near_contact: Indices, fill: Ints, neighbor: Indices, coupling: Floats, slope: Floats,
+) -> None:  # fmt: skip
+    """Couplings W_ij F_j of the contacts of some bodies."""
+    spare = neighbor.size - 1
+    for t in range(begin, stop):
+        b = shared[t]
+        first = span[b, 0]
+        count = span[b, 1]
+        for p in range(count):
+            k = member[first + p] >> 1
+            sign = 1.0 if member[first + p] & 1 else -1.0
+            near_contact[p] = k
+            for axis in range(3):
+                near[p, axis] = sign * n[k, axis]
+            near[p, 3] = F[k] * V[b, 3]
+        for p in range(count):
+            k = near_contact[p]
+            to = fill[k]
+            w = slope[k]
+            for q in range(count):
+                c = (near[p, 0] * near[q, 0] + near[p, 1] * near[q, 1] + near[p, 2] * near[q, 2]) * near[q, 3]
+                # No branch: what a contact does to itself goes to a place that nobody reads.
+                here = spare if p == q else to
+                neighbor[here] = near_contact[q]
+                coupling[here] = c
+                w += 0.0 if p == q else c
+                to += p != q
+            fill[k] = to
+            slope[k] = w
+
+
+@kernel
+def _apply(
+    size: int, found: Indices, F: Floats, end: Floats, n: Floats, pair: Indices, V: Floats, span: Indices,
+    impulse: Floats,
+) -> None:  # fmt: skip
+    """Apply the impulses of one outer iteration, and take its contacts off the bodies' lists."""
+    for k in range(size):
+        P = F[k] * end[k]
+        impulse[found[k]] += P
+        for side in range(2):
+            b = pair[k, side]
+            span[b, 1] = 0
+            dv = (P if side == 1 else -P) * V[b, 3]
+            for axis in range(3):
+                V[b, axis] += dv * n[k, axis]
+
+
+@kernel
+def _most_contacts(span: Indices, V: Floats) -> int:
+    """Contacts of the movable body that has most; the last body is immovable."""
+    most = 0
+    for b in range(span.shape[0] - 1):
+        if V[b, 3] > 0.0:
+            most = max(most, int(np.int64(span[b + 1, 0] - span[b, 0])))
+    return most
+
+
+@kernel
+def _solve_spheres(
+    normal: Floats, body: Indices, V: Floats, threshold: float, defer: float, max_iterations: int, max_visits: int
+) -> tuple[Floats, int, int, int]:
+    """Outer iterations on packed contacts (V is changed)."""
+    m = normal.shape[0]
+    impulse = np.zeros(m)
+    # Per body: its span of all contacts, its active ones, and what `_couple` reads of those of one body.
+    span = _spans(body, V.shape[0])
+    member = np.empty(2 * m, np.uint32)
+    shared = np.empty(V.shape[0] + 1, np.uint32)
+    reach = np.empty(m // TILE + 1, np.int32)
+    most = _most_contacts(span, V)
+    near = np.empty((most, 4))
+    near_contact = np.empty(most, np.uint32)
+    # Per active contact; memory that no iteration needs is never touched.
+    found = np.empty(m + 1, np.uint32)
+    F = np.empty(m + 1)
+    n = np.empty((m, 3))
+    pair = np.empty((m, 2), np.uint32)
+    own = np.empty(m)
+    slope = np.empty(m)
+    end = np.empty(m)
+    awake = np.empty(m, np.uint8)
+    start = np.empty(m + 1, np.int32)
+    fill = np.empty(m, np.int32)
+    order = np.empty(m, np.uint32)
+    woken = np.empty(m, np.uint32)
+    first_key = np.empty(KEYS + 1, np.int32)
+    neighbor = np.empty(1, np.uint32)
+    coupling = np.empty(1)
+    # What only a search by neighborhood needs.
+    contact_of = np.empty(0, np.uint32)
+    seen = np.empty(0, np.int32)
+    size = 0
+    visits = 0
+    iterations = 0
+    everywhere = True
+    while iterations < max_iterations and visits < max_visits:
+        if everywhere:
+            size = _search(normal, body, V, threshold, found, F)
             visits += m
         else:
             if seen.size == 0:
-                seen = np.full(m, -1, np.int32)
-                first_contact, contact_of = _contacts_of_bodies(body, bodies)
-            for t in range(touched_count):
-                b = touched[t]
-                for q in range(first_contact[b], first_contact[b + 1]):
-                    i = contact_of[q]
-                    if seen[i] == iterations:
-                        continue
-                    seen[i] = iterations
-                    F_i = _closing(normal, body, V, i)
-                    found[size] = i
-                    F[size] = F_i
-                    size += F_i > threshold
-                    visits += 1
+                contact_of = _contacts_of_bodies(body, span)
+                seen = np.zeros(m, np.int32)
+            size, looked = _search_nearby(
+                normal, body, V, threshold, found, F, size, pair, span, contact_of, seen, iterations
+            )
+            visits += looked
         if size == 0:
             break
         iterations += 1
         if defer > 0.0:
             size = _keep_fast(size, found, F, defer)
-        visits += size
         everywhere = defer > 0.0 or size * SEARCH_ALL > m
-        if size > room:
-            room = size + size // 8 + 8
-            guess = np.empty(room)
-            key = np.empty(room, np.int32)
-            order = np.empty(room, np.uint32)
-            own = np.empty(room)
-            base = np.empty(room)
-            end = np.empty(room)
-            awake = np.empty(room, np.uint8)
-            start = np.empty(room + 1, np.int32)
-            middle = np.empty(room, np.int32)
-            record = np.empty((2 * room, 4))
-            record_of = np.empty(2 * room, np.uint32)
-        # Force on every body, and how many contacts press on it.
-        touched_count = 0
-        for k in range(size):
-            i = found[k]
-            for side in range(2):
-                b = body[i, side]
-                if V[b, 3] > 0.0:
-                    if count[b] == 0:
-                        touched[touched_count] = b
-                        touched_count += 1
-                        force[b, 0] = force[b, 1] = force[b, 2] = 0.0
-                    count[b] += 1
-                    f = F[k] if side == 1 else -F[k]
-                    force[b, 0] += f * normal[i, 0]
-                    force[b, 1] += f * normal[i, 1]
-                    force[b, 2] += f * normal[i, 2]
-        records = 0
-        couplings = 0
-        for t in range(touched_count):
-            b = touched[t]
-            first[b] = records
-            records += count[b]
-            couplings += count[b] * (count[b] - 1)
-            count[b] = 0
-        # The end of each contact if all others went on for ever; records of each body: F n, that end, the contact.
-        for k in range(size):
-            i = found[k]
-            a = body[i, 0]
-            b = body[i, 1]
-            w = (
-                normal[i, 0] * (V[b, 3] * force[b, 0] - V[a, 3] * force[a, 0])
-                + normal[i, 1] * (V[b, 3] * force[b, 1] - V[a, 3] * force[a, 1])
-                + normal[i, 2] * (V[b, 3] * force[b, 2] - V[a, 3] * force[a, 2])
-            )
-            guess[k] = F[k] / w if w > 0.0 else INF
-            for side in range(2):
-                b = body[i, side]
-                if V[b, 3] > 0.0:
-                    f = F[k] if side == 1 else -F[k]
-                    p = first[b] + count[b]
-                    count[b] += 1
-                    record[p, 0] = f * normal[i, 0]
-                    record[p, 1] = f * normal[i, 1]
-                    record[p, 2] = f * normal[i, 2]
-                    record[p, 3] = guess[k]
-                    record_of[p] = k
-            end[k] = INF
-            awake[k] = 1
-        # Couplings W_ij F_j of each contact: those with neighbors that likely end before it first.
+        visits += size
+        _enlist(size, found, F, normal, body, V, span, member, n, pair, own, slope, end, awake)
+        couplings = _lay_out(size, pair, V, span, member, start, fill, shared, reach)
         if couplings >= neighbor.size:
             neighbor = np.empty(couplings + couplings // 8 + 8, np.uint32)
             coupling = np.empty(neighbor.size)
-        spare = neighbor.size - 1
-        row = 0
-        start[0] = 0
-        for begin in range(0, size, TILE):
-            stop = min(begin + TILE, size)
-            for k in range(begin, stop):
-                i = found[k]
-                length = 0
-                for side in range(2):
-                    b = body[i, side]
-                    if V[b, 3] > 0.0:
-                        length += count[b] - 1
-                early = row
-                late = row + length - 1
-                own_k = 0.0
-                base_k = 0.0
-                guess_k = guess[k]
-                for side in range(2):
-                    b = body[i, side]
-                    if V[b, 3] > 0.0:
-                        inverse_mass = V[b, 3] if side == 1 else -V[b, 3]
-                        x = inverse_mass * normal[i, 0]
-                        y = inverse_mass * normal[i, 1]
-                        z = inverse_mass * normal[i, 2]
-                        for q in range(first[b], first[b] + count[b]):
-                            j = record_of[q]
-                            c = x * record[q, 0] + y * record[q, 1] + z * record[q, 2]
-                            # Selections, no branches; the contact's own record goes to a place that nobody reads.
-                            itself = j == k
-                            before = record[q, 3] <= guess_k
-                            to = spare if itself else (early if before else late)
-                            neighbor[to] = j
-                            coupling[to] = c
-                            own_k += c if itself else 0.0
-                            base_k += c if not before else 0.0
-                            early += before & (not itself)
-                            late -= not before
-                own[k] = own_k
-                base[k] = own_k + base_k
-                middle[k] = early
-                row += length
-                start[k + 1] = row
-            # The tile's rows are still in the cache.
-            _sort(begin, stop, guess, key, first_key, order)
-            _first_sweep(
-                begin, stop, order, F, base, start, middle, neighbor, coupling, end, awake, batch, queue, waiting
+        coupled = 0
+        left = 0
+        for tile in range((size - 1) // TILE + 1):
+            _couple(
+                coupled, reach[tile], shared, F, n, V, span, member, near, near_contact, fill, neighbor, coupling, slope
             )
-        for t in range(touched_count):
-            count[touched[t]] = 0
-        evaluations = _later_sweeps(size, F, own, base, start, neighbor, coupling, end, awake, batch, queue, waiting)
-        if evaluations < 0:
+            coupled = reach[tile]
+            # The tile's part of `fill` has served; its couplings are still in the cache.
+            evaluations, left = _settle(
+                tile * TILE, min(tile * TILE + TILE, size), size, left, F, own, slope, start,
+                neighbor, coupling, end, awake, order, woken, fill, first_key,
+            )  # fmt: skip
+            visits += evaluations
+        if left > 0:
             return impulse, iterations, visits, RESTLESS
-        visits += size + evaluations
-        # Contacts that never end would leave work behind: this iteration is not applied.
-        for k in range(size):
-            if not end[k] < INF:
-                return impulse, iterations, visits, STALLED
-        for k in range(size):
-            i = found[k]
-            a = body[i, 0]
-            b = body[i, 1]
-            P = F[k] * end[k]
-            impulse[i] += P
-            for axis in range(3):
-                V[a, axis] -= V[a, 3] * P * normal[i, axis]
-                V[b, axis] += V[b, 3] * P * normal[i, axis]
+        if not _all_end(size, end):
+            return impulse, iterations, visits, STALLED
+        _apply(size, found, F, end, n, pair, V, span, impulse)
     return impulse, iterations, visits, 0
+
+
+@kernel
+def _search_sparse(
+    J_start: Ints, J_index: Indices, J: Floats, v: Floats, threshold: float, found: Indices, F: Floats
+) -> int:
+    """List the contacts that approach, and how fast; returns how many."""
+    size = 0
+    for i in range(J_start.size - 1):
+        u = 0.0
+        for q in range(J_start[i], J_start[i + 1]):
+            u += J[q] * v[J_index[q]]
+        found[size] = i
+        F[size] = -u
+        size += u < -threshold
+    return size
+
+
+@kernel
+def _enlist_sparse(
+    size: int, found: Indices, F: Floats, J_start: Ints, J_index: Indices, J: Floats,
+    first: Ints, count: Ints, record: Floats, record_of: Indices,
+) -> None:  # fmt: skip
+    """List the active contacts, and J_id F_i, with each velocity d that they read."""
+    count[:] = 0
+    for k in range(size):
+        i = found[k]
+        for q in range(J_start[i], J_start[i + 1]):
+            count[J_index[q]] += 1
+    records = 0
+    for d in range(count.size):
+        first[d] = records
+        records += count[d]
+        count[d] = 0
+    for k in range(size):
+        i = found[k]
+        for q in range(J_start[i], J_start[i + 1]):
+            d = J_index[q]
+            record[first[d] + count[d]] = J[q] * F[k]
+            record_of[first[d] + count[d]] = k
+            count[d] += 1
+
+
+@kernel
+def _couple_sparse(
+    size: int, found: Indices, JM_start: Ints, JM_index: Indices, JM: Floats, first: Ints, count: Ints,
+    record: Floats, record_of: Indices, met: Ints, own: Floats, slope: Floats, end: Floats, awake: Flags,
+    start: Ints, neighbor: Indices, coupling: Floats,
+) -> tuple[Indices, Floats]:  # fmt: skip
+    """Couplings W_ij F_j of all active contacts; returns their arrays, made larger where they were too small."""
+    row = 0
+    met[:size] = -1
+    for k in range(size):
+        i = found[k]
+        start[k] = row
+        if row + size > neighbor.size:
+            more = np.empty(2 * neighbor.size + size, np.uint32)
+            more[:row] = neighbor[:row]
+            neighbor = more
+            grown = np.empty(more.size)
+            grown[:row] = coupling[:row]
+            coupling = grown
+        own_k = 0.0
+        w = 0.0
+        stop = row
+        for q in range(JM_start[i], JM_start[i + 1]):
+            d = JM_index[q]
+            for p in range(first[d], first[d] + count[d]):
+                j = record_of[p]
+                c = JM[q] * record[p]
+                w += c
+                if j == k:
+                    own_k += c
+                elif met[j] < row:
+                    met[j] = stop
+                    neighbor[stop] = j
+                    coupling[stop] = c
+                    stop += 1
+                else:
+                    coupling[met[j]] += c
+        own[k] = own_k
+        slope[k] = w
+        end[k] = PENDING
+        awake[k] = 1
+        row = stop
+    start[size] = row
+    return neighbor, coupling
+
+
+@kernel
+def _apply_sparse(
+    size: int, found: Indices, F: Floats, end: Floats, JM_start: Ints, JM_index: Indices, JM: Floats,
+    v: Floats, impulse: Floats,
+) -> None:  # fmt: skip
+    """Apply the impulses of one outer iteration."""
+    for k in range(size):
+        i = found[k]
+        P = F[k] * end[k]
+        impulse[i] += P
+        for q in range(JM_start[i], JM_start[i + 1]):
+            v[JM_index[q]] += JM[q] * P
 
 
 @kernel
 def _solve_sparse(
     J_start: Ints, J_index: Indices, J: Floats, JM_start: Ints, JM_index: Indices, JM: Floats,
-    v_pre: Floats, threshold: float, defer: float, max_iterations: int,
+    v_pre: Floats, threshold: float, defer: float, max_iterations: int, max_visits: int,
 ) -> tuple[Floats, int, int, int]:  # fmt: skip
     """Outer iterations on sparse matrices."""
     m = J_start.size - 1
-    n = v_pre.size
     v = v_pre.copy()
     impulse = np.zeros(m)
+    # Per velocity: how many active contacts read it, and where their records begin.
+    count = np.empty(v.size, np.int32)
+    first = np.empty(v.size, np.int32)
+    record = np.empty(J.size)
+    record_of = np.empty(J.size, np.uint32)
+    # Per active contact.
     found = np.empty(m + 1, np.uint32)
     F = np.empty(m + 1)
-    # Per velocity: how many active contacts, where their records begin, and its acceleration.
-    count = np.zeros(n, np.int32)
-    first = np.zeros(n, np.int32)
-    a = np.zeros(n)
-    guess = np.empty(m)
-    key = np.empty(m, np.int32)
-    order = np.empty(m, np.uint32)
     own = np.empty(m)
-    base = np.empty(m)
+    slope = np.empty(m)
     end = np.empty(m)
     awake = np.empty(m, np.uint8)
     start = np.empty(m + 1, np.int32)
-    middle = np.empty(m, np.int32)
     met = np.empty(m, np.int32)
-    record = np.empty(J.size)
-    record_of = np.empty(J.size, np.uint32)
+    order = np.empty(m, np.uint32)
+    woken = np.empty(m, np.uint32)
+    first_key = np.empty(KEYS + 1, np.int32)
     neighbor = np.empty(8 * m + 8, np.uint32)
     coupling = np.empty(8 * m + 8)
-    first_key = np.empty(KEYS + 1, np.int32)
-    batch = np.zeros(BATCH)
-    queue = np.zeros(MOST_NEIGHBORS * LANES, np.uint32)
-    waiting = np.zeros(MOST_NEIGHBORS, np.int32)
     visits = 0
     iterations = 0
-    while iterations < max_iterations:
-        # What approaches, and how fast.
-        size = 0
-        for i in range(m):
-            u = 0.0
-            for q in range(J_start[i], J_start[i + 1]):
-                u += J[q] * v[J_index[q]]
-            found[size] = i
-            F[size] = -u
-            size += u < -threshold
+    while iterations < max_iterations and visits < max_visits:
+        size = _search_sparse(J_start, J_index, J, v, threshold, found, F)
         visits += m
         if size == 0:
             break
@@ -653,101 +697,22 @@ def _solve_sparse(
         if defer > 0.0:
             size = _keep_fast(size, found, F, defer)
         visits += size
-        # Acceleration, and how many contacts read each velocity.
-        a[:] = 0.0
-        count[:] = 0
-        for k in range(size):
-            i = found[k]
-            for q in range(JM_start[i], JM_start[i + 1]):
-                a[JM_index[q]] += JM[q] * F[k]
-            for q in range(J_start[i], J_start[i + 1]):
-                count[J_index[q]] += 1
-        records = 0
-        for d in range(n):
-            first[d] = records
-            records += count[d]
-            count[d] = 0
-        # The end of each contact if all others went on for ever.
-        for k in range(size):
-            i = found[k]
-            w = 0.0
-            for q in range(J_start[i], J_start[i + 1]):
-                w += J[q] * a[J_index[q]]
-            guess[k] = F[k] / w if w > 0.0 else INF
-        for k in range(size):
-            i = found[k]
-            met[k] = -1
-            for q in range(J_start[i], J_start[i + 1]):
-                d = J_index[q]
-                record[first[d] + count[d]] = J[q] * F[k]
-                record_of[first[d] + count[d]] = k
-                count[d] += 1
-        # Couplings W_ij F_j of each contact: those with neighbors that likely end before it first.
-        row = 0
-        for k in range(size):
-            i = found[k]
-            start[k] = row
-            if row + size > neighbor.size:
-                more = np.empty(2 * neighbor.size + size, np.uint32)
-                more[:row] = neighbor[:row]
-                neighbor = more
-                grown = np.empty(more.size)
-                grown[:row] = coupling[:row]
-                coupling = grown
-            own_k = 0.0
-            stop = row
-            for q in range(JM_start[i], JM_start[i + 1]):
-                d = JM_index[q]
-                for p in range(first[d], first[d] + count[d]):
-                    j = record_of[p]
-                    c = JM[q] * record[p]
-                    if j == k:
-                        own_k += c
-                    elif met[j] < row:
-                        met[j] = stop
-                        neighbor[stop] = j
-                        coupling[stop] = c
-                        stop += 1
-                    else:
-                        coupling[met[j]] += c
-            own[k] = own_k
-            base_k = own_k
-            middle_k = row
-            for q in range(row, stop):
-                j = neighbor[q]
-                c = coupling[q]
-                if guess[j] <= guess[k]:
-                    neighbor[q] = neighbor[middle_k]
-                    coupling[q] = coupling[middle_k]
-                    neighbor[middle_k] = j
-                    coupling[middle_k] = c
-                    middle_k += 1
-                else:
-                    base_k += c
-            base[k] = base_k
-            middle[k] = middle_k
-            row = stop
-        start[size] = row
-        end[:size] = INF
-        awake[:size] = 1
+        _enlist_sparse(size, found, F, J_start, J_index, J, first, count, record, record_of)
+        neighbor, coupling = _couple_sparse(
+            size, found, JM_start, JM_index, JM, first, count, record, record_of, met, own, slope, end, awake,
+            start, neighbor, coupling,
+        )  # fmt: skip
+        left = 0
         for begin in range(0, size, TILE):
-            stop = min(begin + TILE, size)
-            _sort(begin, stop, guess, key, first_key, order)
-            _first_sweep(
-                begin, stop, order, F, base, start, middle, neighbor, coupling, end, awake, batch, queue, waiting
-            )
-        evaluations = _later_sweeps(size, F, own, base, start, neighbor, coupling, end, awake, batch, queue, waiting)
-        if evaluations < 0:
+            # `met` has served: it takes the sorting keys.
+            evaluations, left = _settle(
+                begin, min(begin + TILE, size), size, left, F, own, slope, start,
+                neighbor, coupling, end, awake, order, woken, met, first_key,
+            )  # fmt: skip
+            visits += evaluations
+        if left > 0:
             return impulse, iterations, visits, RESTLESS
-        visits += size + evaluations
-        # Contacts that never end would leave work behind: this iteration is not applied.
-        for k in range(size):
-            if not end[k] < INF:
-                return impulse, iterations, visits, STALLED
-        for k in range(size):
-            i = found[k]
-            P = F[k] * end[k]
-            impulse[i] += P
-            for q in range(JM_start[i], JM_start[i + 1]):
-                v[JM_index[q]] += JM[q] * P
+        if not _all_end(size, end):
+            return impulse, iterations, visits, STALLED
+        _apply_sparse(size, found, F, end, JM_start, JM_index, JM, v, impulse)
     return impulse, iterations, visits, 0

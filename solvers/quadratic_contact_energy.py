@@ -20,6 +20,7 @@ paper → here: S → end, J q̇ → u, A → w/2, B → v, C → e (all three d
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple, TypedDict
 
 import numpy as np
 import numpy.typing as npt
@@ -27,16 +28,17 @@ import numpy.typing as npt
 from solvers import qce_stream, recovery
 from solvers._jit import kernel
 from solvers.problem import ImpactProblem
-from solvers.qce_heap import solve_by_heap
+from solvers.qce_heap import MAX_VISITS, solve_by_heap
 from solvers.solution import Floats, ImpactSolution, Status, UnsupportedProblem
-from solvers.sphere_rows import sphere_rows
+from solvers.sphere_rows import SphereRows, sphere_rows
 
 Ints = npt.NDArray[np.int32]
 Indices = npt.NDArray[np.uint32]
 
-# Up to here the heap is as fast (sphere packs: equal near 300 contacts, the stream twice as fast at 800; measured).
-SMALL = 200
-# An evaluation of `qce_stream` costs the square of a contact's neighbors, the heap's only their number.
+# Up to here the heap is as fast: equal on a rack of 136 contacts, where packing takes half of the stream's time; a
+# sphere pack of 299 takes the stream a third of the heap's time (measured).
+SMALL = 100
+# The stream holds the couplings of all pairs of a body's active contacts, the square of their number.
 MOST_CONTACTS_OF_A_BODY = 32
 
 
@@ -50,6 +52,9 @@ class QuadraticContactEnergy:
     max_iterations: int = 10_000
     """Bound on outer iterations (compression phases)."""
 
+    max_visits: int = MAX_VISITS
+    """Bound on contact visits; the default is about a minute on one thread."""
+
     recover_after: int = 0
     """Outer iterations after which what still approaches is resolved inelastically; 0 = never (the published law)."""
 
@@ -60,7 +65,13 @@ class QuadraticContactEnergy:
             return recovery.resolve(
                 problem, replace(self, recover_after=0, max_iterations=self.recover_after).solve(problem)
             )
-        return solve_elastic(problem, defer=0.0, tolerance=self.tolerance, max_iterations=self.max_iterations)
+        return solve_elastic(
+            problem,
+            defer=0.0,
+            tolerance=self.tolerance,
+            max_iterations=self.max_iterations,
+            max_visits=self.max_visits,
+        )
 
 
 @dataclass(frozen=True)
@@ -80,10 +91,19 @@ class DeferredContactEnergy:
     max_iterations: int = 10_000
     """Bound on outer iterations (compression phases)."""
 
+    max_visits: int = MAX_VISITS
+    """Bound on contact visits; the default is about a minute on one thread."""
+
     def solve(self, problem: ImpactProblem) -> ImpactSolution:
         """Solve one multi-impact; restitution and friction must be 1 and 0."""
         require_elastic(problem, "qce-defer")
-        return solve_elastic(problem, defer=self.defer, tolerance=self.tolerance, max_iterations=self.max_iterations)
+        return solve_elastic(
+            problem,
+            defer=self.defer,
+            tolerance=self.tolerance,
+            max_iterations=self.max_iterations,
+            max_visits=self.max_visits,
+        )
 
 
 def require_elastic(problem: ImpactProblem, law: str) -> None:
@@ -98,7 +118,14 @@ def require_elastic(problem: ImpactProblem, law: str) -> None:
         raise UnsupportedProblem(f"{law} has no friction: friction must be 0 (qce-lcp takes any)")
 
 
-def solve_elastic(problem: ImpactProblem, *, defer: float, tolerance: float, max_iterations: int) -> ImpactSolution:
+def solve_elastic(
+    problem: ImpactProblem,
+    *,
+    defer: float,
+    tolerance: float,
+    max_iterations: int,
+    max_visits: int = MAX_VISITS,
+) -> ImpactSolution:
     """Run QCE's outer iteration on a problem, whatever its restitution and friction say.
 
     Args:
@@ -106,42 +133,87 @@ def solve_elastic(problem: ImpactProblem, *, defer: float, tolerance: float, max
         defer: contacts with F_i < defer · max F wait for the next outer iteration; dimensionless.
         tolerance: a contact approaches when u < -tolerance times the largest |u_pre|; dimensionless.
         max_iterations: bound on outer iterations.
+        max_visits: bound on contact visits.
     """
     speed = problem.speed
     threshold = speed * tolerance
-    impulse, iterations, visits, stalled = _outer_iterations(problem, threshold, defer, max_iterations)
-    J, JM = problem.J, problem.JM
-    v, u_min = _outcome(
-        J.indptr, J.indices.view(np.uint32), J.data, JM.indptr, JM.indices.view(np.uint32), JM.data,
-        problem.v_pre, impulse,
-    )  # fmt: skip
-    if not np.isfinite(v).all():
+    settings = _Settings(threshold=threshold, defer=defer, max_iterations=max_iterations, max_visits=max_visits)
+    reached = None
+    if problem.m >= SMALL and _most_contacts(problem.JM.indices, problem.n) <= MOST_CONTACTS_OF_A_BODY:
+        rows = sphere_rows(problem)
+        reached = _stream_sparse(problem, settings) if rows is None else _stream_spheres(problem, rows, settings)
+    if reached is None:
+        impulse, iterations, visits, stalled = solve_by_heap(problem, **settings)
+        reached = _Reached(impulse, *_outcome_of(problem, impulse), iterations, visits, stalled)
+    if not np.isfinite(reached.v).all():
         status = Status.NOT_FINITE
-    elif stalled:
+    elif reached.stalled:
         status = Status.STALLED
-    elif iterations >= max_iterations and u_min < -threshold:
+    elif reached.approach > threshold and (reached.iterations >= max_iterations or reached.visits >= max_visits):
         status = Status.ITERATION_LIMIT
     else:
         status = Status.CONVERGED
-    return ImpactSolution(impulse, v, status, iterations, visits, max(-u_min, 0.0) / (speed or 1.0))
+    residual = reached.approach / (speed or 1.0)
+    return ImpactSolution(reached.impulse, reached.v, status, reached.iterations, reached.visits, residual)
 
 
-def _outer_iterations(
-    problem: ImpactProblem, threshold: float, defer: float, max_iterations: int
-) -> tuple[Floats, int, int, bool]:
-    """Choose between heap and stream, which give the same; impulse, outer iterations, contact visits, stalled."""
-    if problem.m >= SMALL and np.diff(problem.MJT.indptr).max(initial=0) <= MOST_CONTACTS_OF_A_BODY:
-        rows = sphere_rows(problem)
-        if rows is None:
-            streamed = qce_stream.solve_sparse(problem, threshold=threshold, defer=defer, max_iterations=max_iterations)
-        else:
-            streamed = qce_stream.solve_spheres(rows, threshold=threshold, defer=defer, max_iterations=max_iterations)
-        impulse, iterations, visits, flag = streamed
-        if flag != qce_stream.RESTLESS:
-            if rows is not None:
-                impulse = rows.in_problem_order(impulse)
-            return impulse, iterations, visits, flag == qce_stream.STALLED
-    return solve_by_heap(problem, threshold=threshold, defer=defer, max_iterations=max_iterations)
+class _Settings(TypedDict):
+    """What heap and stream are told."""
+
+    threshold: float
+    defer: float
+    max_iterations: int
+    max_visits: int
+
+
+class _Reached(NamedTuple):
+    """What heap and stream come to; `approach` is the largest -u afterwards [m/s], at least 0."""
+
+    impulse: Floats
+    v: Floats
+    approach: float
+    iterations: int
+    visits: int
+    stalled: bool
+
+
+def _stream_spheres(problem: ImpactProblem, rows: SphereRows, settings: _Settings) -> _Reached | None:
+    """Stream packed contacts; None where no fixed point was found."""
+    impulse, iterations, visits, flag = qce_stream.solve_spheres(rows, **settings)
+    if flag == qce_stream.RESTLESS:
+        return None
+    v = rows.velocity_in_problem_order(rows.V, problem.n)
+    approach = qce_stream.largest_approach(rows)
+    return _Reached(rows.in_problem_order(impulse), v, approach, iterations, visits, flag == qce_stream.STALLED)
+
+
+def _stream_sparse(problem: ImpactProblem, settings: _Settings) -> _Reached | None:
+    """Stream sparse matrices; None where no fixed point was found."""
+    impulse, iterations, visits, flag = qce_stream.solve_sparse(problem, **settings)
+    if flag == qce_stream.RESTLESS:
+        return None
+    return _Reached(impulse, *_outcome_of(problem, impulse), iterations, visits, flag == qce_stream.STALLED)
+
+
+def _outcome_of(problem: ImpactProblem, impulse: Floats) -> tuple[Floats, float]:
+    """Velocity after an impulse, and the largest approach velocity then, at least 0."""
+    J, JM = problem.J, problem.JM
+    return _outcome(
+        J.indptr, J.indices.view(np.uint32), J.data, JM.indptr, JM.indices.view(np.uint32), JM.data,
+        problem.v_pre, impulse,
+    )  # fmt: skip
+
+
+@kernel
+def _most_contacts(JM_index: Ints, n: int) -> int:
+    """Most contacts that change one velocity."""
+    count = np.zeros(n, np.int32)
+    for d in JM_index:
+        count[d] += 1
+    most = 0
+    for d in range(n):
+        most = max(most, count[d])
+    return most
 
 
 @kernel
@@ -149,16 +221,16 @@ def _outcome(
     J_start: Ints, J_index: Indices, J: Floats, JM_start: Ints, JM_index: Indices, JM: Floats,
     v_pre: Floats, impulse: Floats,
 ) -> tuple[Floats, float]:  # fmt: skip
-    """Velocity after an impulse, and the smallest u, at most 0; in a kernel, as sparse products cost 30 µs a call."""
+    """Velocity after an impulse, and the largest -u, at least 0; in a kernel, as sparse products cost 30 µs a call."""
     v = v_pre.copy()
     for i in range(impulse.size):
         if impulse[i] != 0.0:
             for q in range(JM_start[i], JM_start[i + 1]):
                 v[JM_index[q]] += JM[q] * impulse[i]
-    u_min = 0.0
+    approach = 0.0
     for i in range(impulse.size):
         u = 0.0
         for q in range(J_start[i], J_start[i + 1]):
             u += J[q] * v[J_index[q]]
-        u_min = min(u_min, u)
-    return v, u_min
+        approach = max(approach, -u)
+    return v, approach

@@ -61,11 +61,10 @@ def resolve(
         problem, np.zeros(problem.m), v_start=solution.v_post, tolerance=tolerance, max_sweeps=max_sweeps
     )
     impulse = None if solution.impulse is None else solution.impulse + rest.impulse
-    v_post = rest.v if impulse is None else problem.v_after(impulse, solution.friction_impulse)
-    u_min = float((problem.J @ v_post).min(initial=0.0))
+    u_min = float((problem.J @ rest.v).min(initial=0.0))
     return ImpactSolution(
         impulse,
-        v_post,
+        rest.v,
         solution.status,
         solution.iterations + 1,
         solution.visits + rest.visits,

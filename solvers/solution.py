@@ -22,8 +22,9 @@ class Status(Enum):
     CONVERGED = ("converged", "The law's own stopping test passed.", "Nothing.")
     ITERATION_LIMIT = (
         "iteration limit",
-        "The iteration bound was reached before the stopping test passed; the result is the last iterate.",
-        "Raise the solver's iteration setting, loosen its tolerance, or accept the residual that it reports.",
+        "The bound on iterations or contact visits was reached before the stopping test passed; the result is the last "
+        "iterate.",
+        "Raise the solver's max_iterations or max_visits, loosen its tolerance, or accept its residual.",
     )
     STALLED = (
         "stalled",
@@ -97,6 +98,8 @@ class Solver(Protocol):
     7. A law that does not apply (friction, unequal restitution, too many contacts) raises
        `UnsupportedProblem("reason")`. Input is checked by `ImpactProblem` already.
     8. `iterations` and `visits` count the work done.
+    9. A method whose answer does not depend on where it starts may take `start`, a keyword-only first guess of the
+       normal impulse of shape (m,): `bench` then measures what a warm start saves.
     """
 
     def solve(self, problem: ImpactProblem) -> ImpactSolution:

@@ -12,7 +12,7 @@ which that search meets them, so that neighbors in space are neighbors in memory
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
@@ -45,11 +45,21 @@ class SphereRows:
     contact: Ints
     """The problem's number of each contact, shape (m,)."""
 
+    owner: Ints = field(default_factory=lambda: np.empty(0, np.int32))
+    """The problem's number of each body, shape (bodies + 1,); empty for rows that come without an `ImpactProblem`."""
+
     def in_problem_order(self, per_contact: Floats) -> Floats:
         """Put an array over these contacts, shape (m,), in the problem's order."""
         ordered = np.empty_like(per_contact)
         ordered[self.contact] = per_contact
         return ordered
+
+    def velocity_in_problem_order(self, V: Floats, n: int) -> Floats:
+        """Put velocities of these bodies, shape (bodies + 1, ≥ 3), in the problem's order, shape (n,)."""
+        bodies = self.owner.size - 1
+        ordered = np.empty((bodies, n // bodies))
+        ordered[self.owner[:-1]] = V[:-1, : n // bodies]
+        return ordered.reshape(n)
 
 
 def sphere_rows(problem: ImpactProblem) -> SphereRows | None:
@@ -80,7 +90,8 @@ def _packed(problem: ImpactProblem, width: int, inverse_mass: Floats) -> SphereR
     V[:bodies, :width] = problem.v_pre.reshape(bodies, width)
     V[:bodies, 3] = inverse_mass
     if problem.m < RENUMBERED:
-        return SphereRows(normal, body, V, np.arange(problem.m, dtype=np.int32))
+        every = np.arange(max(problem.m, bodies + 1), dtype=np.int32)
+        return SphereRows(normal, body, V, every[: problem.m], every[: bodies + 1])
     return SphereRows(*_renumber(normal, body, V))
 
 
@@ -101,6 +112,21 @@ def _pack(
     """Fill normals and bodies; false at the first row that is not n on one body and -n on another."""
     other = np.zeros(3)
     for i in range(J_start.size - 1):
+        # Most rows: all entries of one body, then their negatives on another.
+        q = J_start[i]
+        if J_start[i + 1] - q == 2 * width:
+            b = _owner(J_index[q], width)
+            a = _owner(J_index[q + width], width)
+            opposite = 0
+            for axis in range(width):
+                normal[i, axis] = J[q + axis]
+                opposite += (J_index[q + axis] == b * width + axis) & (J_index[q + width + axis] == a * width + axis)
+                opposite += J[q + width + axis] == -J[q + axis]
+            if opposite == 2 * width:
+                body[i, 0] = a
+                body[i, 1] = b
+                continue
+            normal[i, 0] = normal[i, 1] = normal[i, 2] = 0.0
         a = b = bodies
         other[0] = other[1] = other[2] = 0.0
         for q in range(J_start[i], J_start[i + 1]):
@@ -124,8 +150,8 @@ def _pack(
 
 
 @kernel
-def _renumber(normal: Floats, body: Indices, V: Floats) -> tuple[Floats, Indices, Floats, Ints]:
-    """Normals, bodies, velocities and contacts in the order in which a breadth-first search meets them."""
+def _renumber(normal: Floats, body: Indices, V: Floats) -> tuple[Floats, Indices, Floats, Ints, Ints]:
+    """Normals, bodies, velocities, contacts and bodies in the order in which a breadth-first search meets them."""
     m = body.shape[0]
     bodies = V.shape[0] - 1
     first = np.zeros(bodies + 3, np.int32)
@@ -134,19 +160,22 @@ def _renumber(normal: Floats, body: Indices, V: Floats) -> tuple[Floats, Indices
         first[body[i, 1] + 2] += 1
     for b in range(2, bodies + 3):
         first[b] += first[b - 1]
-    contact_of = np.empty(2 * m, np.int32)
+    # Contacts of each body: twice their number, plus its side; and the body on the other side.
+    link = np.empty((2 * m, 2), np.int32)
     for i in range(m):
         for side in range(2):
             b = body[i, side] + 1
-            contact_of[first[b]] = i
+            link[first[b], 0] = 2 * i + side
+            link[first[b], 1] = body[i, 1 - side]
             first[b] += 1
     contact = np.empty(m, np.int32)
+    new_normal = np.empty((m, 3))
+    new_body = np.empty((m, 2), np.uint32)
     order = np.empty(bodies + 1, np.int32)
     order[bodies] = bodies
     number = np.full(bodies + 1, -1, np.int32)
     number[bodies] = bodies
-    seen = np.zeros(m, np.bool_)
-    contacts = 0
+    k = 0
     head = 0
     tail = 0
     for root in range(bodies):
@@ -157,30 +186,61 @@ def _renumber(normal: Floats, body: Indices, V: Floats) -> tuple[Floats, Indices
         tail += 1
         while head < tail:
             b = order[head]
-            head += 1
             for q in range(first[b], first[b + 1]):
-                i = contact_of[q]
-                if seen[i]:
+                c = link[q, 1]
+                if number[c] < 0:
+                    number[c] = tail
+                    order[tail] = c
+                    tail += 1
+                if number[c] < head:
+                    # Met from its other body.
                     continue
-                seen[i] = True
-                contact[contacts] = i
-                contacts += 1
-                for side in range(2):
-                    c = body[i, side]
-                    if number[c] < 0:
-                        number[c] = tail
-                        order[tail] = c
-                        tail += 1
-    new_normal = np.empty((m, 3))
-    new_body = np.empty((m, 2), np.uint32)
-    for k in range(m):
-        i = contact[k]
-        new_body[k, 0] = number[body[i, 0]]
-        new_body[k, 1] = number[body[i, 1]]
-        for axis in range(3):
-            new_normal[k, axis] = normal[i, axis]
+                i = link[q, 0] >> 1
+                side = link[q, 0] & 1
+                contact[k] = i
+                new_body[k, side] = head
+                new_body[k, 1 - side] = number[c]
+                for axis in range(3):
+                    new_normal[k, axis] = normal[i, axis]
+                k += 1
+            head += 1
     new_V = np.empty_like(V)
     for k in range(bodies + 1):
         for column in range(4):
             new_V[k, column] = V[order[k], column]
-    return new_normal, new_body, new_V, contact
+    return new_normal, new_body, new_V, contact, order
+
+
+def sparse_rows(rows: SphereRows) -> tuple[Ints, Indices, Floats, Ints, Indices, Floats]:
+    """J and J M⁻¹ of packed contacts as CSR (start, index, value), three velocities a body, all in the packed order."""
+    return _sparse_rows(rows.normal, rows.body, rows.V)
+
+
+@kernel
+def _sparse_rows(normal: Floats, body: Indices, V: Floats) -> tuple[Ints, Indices, Floats, Ints, Indices, Floats]:
+    """Entries that are zero, and immovable bodies in J M⁻¹, are left out."""
+    m = normal.shape[0]
+    J_start = np.zeros(m + 1, np.int32)
+    J_index = np.empty(6 * m, np.uint32)
+    J = np.empty(6 * m)
+    JM_start = np.zeros(m + 1, np.int32)
+    JM_index = np.empty(6 * m, np.uint32)
+    JM = np.empty(6 * m)
+    p = 0
+    q = 0
+    for i in range(m):
+        for side in range(2):
+            b = body[i, side]
+            for axis in range(3):
+                n = normal[i, axis] if side == 1 else -normal[i, axis]
+                if n != 0.0 and b < V.shape[0] - 1:
+                    J_index[p] = 3 * b + axis
+                    J[p] = n
+                    p += 1
+                    if V[b, 3] > 0.0:
+                        JM_index[q] = 3 * b + axis
+                        JM[q] = n * V[b, 3]
+                        q += 1
+        J_start[i + 1] = p
+        JM_start[i + 1] = q
+    return J_start, J_index[:p], J[:p], JM_start, JM_index[:q], JM[:q]

@@ -40,17 +40,32 @@ def cluster(rng: np.random.Generator, *, dimension: int) -> ImpactProblem:
     return ImpactProblem(inverse_mass, J, rng.normal(size=centers.size))
 
 
-def random_jacobian(rng: np.random.Generator) -> ImpactProblem:
-    """Random rows and a dense mass matrix; one direction opens every contact, so that elastic iterations end."""
+def random_rows(rng: np.random.Generator) -> npt.NDArray[np.float64]:
+    """Up to twice as many rows as the 2 to 8 velocities; one direction opens every contact: elastic iterations end."""
     n = int(rng.integers(2, 9))
     m = int(rng.integers(1, 2 * n))
     J = rng.normal(size=(m, n))
     opening = rng.normal(size=n)
-    J *= np.sign(J @ opening)[:, None]
+    return J * np.sign(J @ opening)[:, None]
+
+
+def random_jacobian(rng: np.random.Generator) -> ImpactProblem:
+    """Random rows and a dense mass matrix of condition up to ten."""
+    J = random_rows(rng)
+    n = J.shape[1]
     # Principal masses within a factor of ten, in random directions: an energy is then known to rounding.
     directions, _ = np.linalg.qr(rng.normal(size=(n, n)))
     inverse_mass = directions @ np.diag(10.0 ** rng.uniform(-0.5, 0.5, n)) @ directions.T
     return ImpactProblem(0.5 * (inverse_mass + inverse_mass.T), J, rng.normal(size=n))
+
+
+def ill_conditioned(seed: int) -> ImpactProblem:
+    """Random rows and a dense mass matrix whose condition has no bound: 1e3 is usual, 1e6 occurs."""
+    rng = np.random.default_rng(seed)
+    J = random_rows(rng)
+    n = J.shape[1]
+    root = rng.normal(size=(n, n)) + 2.0 * np.eye(n)
+    return ImpactProblem(root @ root.T, J, rng.normal(size=n))
 
 
 def make(kind: str, seed: int) -> ImpactProblem:

@@ -33,7 +33,6 @@ from harness.work_precision import (
     measure_errors,
     plan_bench,
     run_bench,
-    takes_start,
 )
 from scenarios import CATALOG
 from solvers import SOLVERS
@@ -239,14 +238,6 @@ def test_energy_and_momentum_are_measured_by_the_harness() -> None:
     found = values(measure_errors(SOLVERS["qce"](), CATALOG["newtons-cradle"](balls=5)))
     assert found[ENERGY] < 1e-12
     assert found[MOMENTUM] < 1e-12
-
-
-def test_no_solver_takes_a_start_unless_it_says_so() -> None:
-    class Starting:
-        def solve(self, problem: object, start: object = None) -> None: ...
-
-    assert takes_start(Starting())  # type: ignore[arg-type]
-    assert not takes_start(SOLVERS["qce"]())
 
 
 # --- the run ----------------------------------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ import pytest
 
 from harness.measurement import Kind, Measurement, Outcome, Score, Series, Task, shown
 from harness.store import Ending, PlannedTask, Store
-from harness.work_precision import COLD, ERRORS, SCALING, TIMES, VERIFICATION
+from harness.work_precision import COLD, ERRORS, SCALING, TIMES, VERIFICATION, WARM
 from reports.bench import NOT_REACHED, bench_markdown, write_bench
 from reports.bench_rows import Bench, cost_matrix, exponent, is_own_reference, laws, reach, scenes, sweep
 from reports.scorecard import ReportError
@@ -91,8 +91,18 @@ class Making:
                     self.record(number, None, Outcome.TIMED_OUT)
 
     def first_solves(self) -> None:
-        columns = {"first_s": 0.25, "second_s": 1e-4, "takes_start": False}
+        columns = {"first_s": 0.25, "second_s": 1e-4}
         self.record(self.task(COLD, "qce", "chain"), Measurement("", 0, 0, (), (Series(COLD, columns),)))
+
+    def warm(self) -> None:
+        """Three steps, four times as fast and with half of the visits from the last impulse."""
+        for k in range(2):
+            columns = {
+                "cold_s": [0.2, 0.1, 0.1], "warm_s": [0.05, 0.03, 0.02], "cold_visits": [100, 60, 40],
+                "warm_visits": [50, 30, 20], "difference": 1e-11, "statuses": ["converged"],
+            }  # fmt: skip
+            number = self.task(WARM, "lcp-pgs", "layer", round=k)
+            self.record(number, Measurement("", 0, 0, (), (Series(WARM, columns),)))
 
 
 @pytest.fixture
@@ -195,11 +205,15 @@ def test_a_slow_calibration_kernel_makes_the_machine_noisy(making: Making) -> No
     assert "**NOISY MACHINE**" in page(making)
 
 
-def test_first_solves_and_the_missing_warm_start_are_reported(making: Making) -> None:
+def test_first_solves_are_reported(making: Making) -> None:
     making.first_solves()
-    text = page(making)
-    assert table_rows(text, "qce") == [["qce", "250 ms", "100 µs", "1"]]
-    assert "not applicable: no solver here takes a start" in text
+    assert table_rows(page(making), "qce") == [["qce", "250 ms", "100 µs", "1"]]
+
+
+def test_warm_start_is_reported_beside_cold(making: Making) -> None:
+    making.warm()
+    (row,) = table_rows(page(making), "lcp-pgs")
+    assert row[2:] == ["3", "400 ms", "100 ms", "4.00", "200 → 100", "1e-11", "converged"]
 
 
 def test_an_open_task_makes_the_page_incomplete(making: Making) -> None:

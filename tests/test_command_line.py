@@ -21,7 +21,7 @@ from scenarios import CATALOG
 from solvers import SOLVERS
 
 ROOT = Path(__file__).parent.parent
-COMMANDS = ("accept", "bench", "check", "claims", "export", "figures", "list", "replay", "run", "scorecard")
+COMMANDS = ("accept", "bench", "check", "claims", "export", "figures", "list", "replay", "run", "scorecard", "simulate")
 # Modules that `--help` must not wait for: each takes a tenth of a second or more.
 HEAVY = ("numpy", "scipy", "numba", "pandas", "matplotlib", "rich", "pebble")
 

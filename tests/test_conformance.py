@@ -13,6 +13,7 @@ import pytest
 
 from harness.conformance import POINTS, check_solver, parametrize_with_checks, solver_checks
 from solvers import SOLVERS, ImpactProblem, ImpactSolution, Solver, Status, UnsupportedProblem
+from solvers.solution import Floats
 
 pytest_plugins = ["harness.pytest_plugin"]
 
@@ -62,7 +63,8 @@ def test_every_law_of_the_registry_conforms(name: str, check_solver: Callable[[S
 
 
 def test_every_point_of_the_contract_is_checked() -> None:
-    names = [name for name, _ in solver_checks(Honest())]
+    # One that takes a start: the point about it is for those alone.
+    names = [name for name, _ in solver_checks(SOLVERS["lcp-pgs"]())]
     assert {int(name.split()[0]) for name in names} == set(POINTS)
     assert len(set(names)) == len(names)
 
@@ -182,6 +184,21 @@ def counting_halves(problem: ImpactProblem, solution: ImpactSolution) -> ImpactS
     return replace(solution, visits=half)
 
 
+def adding_to_its_start(self: Honest, problem: ImpactProblem, *, start: Floats | None = None) -> ImpactSolution:
+    solution = Honest.solve(self, problem)
+    if start is None or solution.impulse is None:
+        return solution
+    impulse = solution.impulse + start
+    # No claim to have converged: the fault is the start alone.
+    return replace(solution, impulse=impulse, v_post=problem.v_after(impulse), status=Status.STALLED)
+
+
+def refusing_a_start(self: Honest, problem: ImpactProblem, *, start: Floats | None = None) -> ImpactSolution:
+    if start is not None:
+        raise UnsupportedProblem("no start")
+    return Honest.solve(self, problem)
+
+
 FAULTS: dict[str, tuple[int, str, object]] = {
     "noise": (1, "one after the other differ in visits", changed(with_noise)),
     "overwriting": (2, "writes to the problem", overwriting),
@@ -205,6 +222,8 @@ FAULTS: dict[str, tuple[int, str, object]] = {
     "refuses without a reason": (7, "without a reason", refusing_without_reason),
     "counts nothing": (8, "must count the work", changed(lambda _, s: replace(s, iterations=0, visits=0))),
     "counts in floats": (8, "visits must be an integer", changed(counting_halves)),
+    "adds to its start": (9, "started from its own answer", adding_to_its_start),
+    "refuses a start": (9, "refuses to start", refusing_a_start),
 }
 """What is wrong → the point of the contract that it breaks, what the message says, and the `solve` that does it."""
 

@@ -25,7 +25,7 @@ pytestmark = pytest.mark.long
 REFERENCE_SPHERES = 4000
 REFERENCE_STEPS = 100.0
 # steps_per_contact and gap_memory that belong together: neither error is far below the other.
-SETTINGS = ((2.0, 0.3), (2.5, 0.2), (3.0, 0.1), (4.0, 0.03), (8.0, 0.01))
+SETTINGS = ((1.75, 0.3), (2.0, 0.2), (2.5, 0.1), (3.0, 0.05), (4.0, 0.03), (8.0, 0.01))
 ENERGY = 1e-13
 
 

@@ -1,0 +1,351 @@
+"""Run a moving scene with one solver: a row a step, frames, checkpoints, the six scores over the run.
+
+    results.sqlite       what was measured: the whole run, and probes of single impacts (see `harness.store`)
+    series.csv           one row a step (`COLUMNS`)
+    measures.csv         one row a frame: what the scene is judged by
+    trajectory-*.npz     frames (see `harness.trajectory`)
+    checkpoint.npz       the whole state, and how many rows and frames go with it
+
+A probe is the impact of one step taken by itself: the solver's answer to it is scored as any impact of the catalog.
+A run that is interrupted, or that fails, keeps all steps that it made; the same call goes on, bit for bit.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from harness import desiderata
+from harness.checked import ratio
+from harness.environment import describe_environment
+from harness.files import replace_file
+from harness.measure import measure_impact
+from harness.measurement import (
+    InvalidSolution,
+    Kind,
+    Measurement,
+    Outcome,
+    Score,
+    Task,
+    not_applicable,
+    shown,
+    upper_bound,
+)
+from harness.run import COMPARED
+from harness.store import Ending, PlannedTask, Store
+from harness.trajectory import Frame, RowWriter, TrajectoryWriter, read_rows
+from scenarios.scenario import Invariant, Scenario
+from scenarios.world.checkpoint import CheckpointError, checkpoint, resume
+from scenarios.world.impact import Streamed
+from scenarios.world.moving_scene import MovingScene, MovingWorld
+from scenarios.world.stepping import StepReport
+from solvers import ImpactProblem, ProblemError, Solver, UnsupportedProblem
+from solvers.solution import Floats
+
+CHECKPOINT = "checkpoint.npz"
+STEPS, MEASURES = "series.csv", "measures.csv"
+RUN, PROBE = "run", "probe"
+"""What the tasks of a simulation are: the parameter "of" of each."""
+COLUMNS = (
+    "step", "time", "contacts", "status", "iterations", "sweeps", "residual", "overlap", "fastest",
+    "kinetic", "potential", "impact", "friction", "correction", "shaking", "integration", "wall_s",
+)  # fmt: skip
+"""Columns of the series; all but wall_s come out the same whenever the run is repeated."""
+# Impacts of a run that are scored by themselves, evenly spread over it.
+PROBES = 8
+# A probe solves its impact again and again, renumbered and mirrored: above this many contacts that takes minutes.
+MOST_PROBED = 2_000
+
+
+class SimulationError(ValueError):
+    """A simulation cannot go on; the text says at which step and why. What it measured is kept."""
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """How long a simulation runs, and what it leaves behind when."""
+
+    steps: int
+    """Steps of the whole run, those of earlier calls included."""
+    frame_every: int
+    """Steps between two frames."""
+    checkpoint_every: int
+    """Steps between two checkpoints."""
+
+    def __post_init__(self) -> None:
+        for name, value in asdict(self).items():
+            if value < 1:
+                raise SimulationError(f"{name} must be at least 1, not {value}")
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """What is run."""
+
+    scene: MovingScene
+    specification: str
+    """The solver, as results are labeled."""
+    solver: Solver | Streamed
+    seed: int
+
+
+@dataclass(frozen=True)
+class State:
+    """How far a simulation is."""
+
+    report: StepReport
+    steps: int
+    """Steps of the whole run."""
+    measures: Mapping[str, float]
+    """What the scene measured last."""
+
+
+def simulate(
+    simulation: Simulation,
+    folder: Path,
+    schedule: Schedule,
+    *,
+    command: str,
+    until: Callable[[Mapping[str, float]], bool] = lambda _: False,
+    on_step: Callable[[State], None] = lambda _: None,
+) -> str:
+    """Run a scene, or go on with it.
+
+    Args:
+        simulation: scene, solver, seed.
+        folder: results folder of this run alone.
+        schedule: how long, and what is kept when.
+        command: as it was called, for the record.
+        until: ends the run where it says so of the scene's measures, at a frame.
+        on_step: called after every step.
+
+    Returns:
+        Why the run ended, in words.
+
+    Raises:
+        SimulationError: the scene cannot go on: a step too large, a solver that refuses it.
+        StoreError: the folder cannot be used, or holds another simulation.
+        KeyboardInterrupt: all steps made are kept; the same call goes on.
+    """
+    environment = describe_environment()
+    comparable = {key: environment[key] for key in COMPARED if key != "cpu"}
+    identity = {"results of": "simulation", "scene": simulation.scene.label, "solver": simulation.specification}
+    with Store.create_or_open(folder, {**comparable, **identity, "seed": simulation.seed}) as store:
+        run = store.begin_run(
+            version=str(environment["impactbench"]), environment=environment,
+            settings={**identity, **asdict(schedule), "seed": simulation.seed}, command=command,
+        )  # fmt: skip
+        recorder = _Recorder(simulation, folder, schedule)
+        try:
+            why = _run(recorder, _Probes(simulation, store, run), schedule, until, on_step)
+        finally:
+            # Also of a run that cannot go on: its last steps tell why.
+            recorder.checkpoint()
+            _record_run(simulation, folder, store, run, steps=recorder.world.steps)
+        store.finish_run(run)
+    return why
+
+
+def _run(
+    recorder: _Recorder,
+    probes: _Probes,
+    schedule: Schedule,
+    until: Callable[[Mapping[str, float]], bool],
+    on_step: Callable[[State], None],
+) -> str:
+    """Step until the schedule or the scene says that it is enough."""
+    world = recorder.world
+    probe_every = max(schedule.steps // PROBES, 1)
+    while world.steps < schedule.steps:
+        if world.over:
+            return f"no further impact will come after step {world.steps}"
+        try:
+            if world.steps % probe_every == probe_every // 2:
+                probes.take(world)
+            report = recorder.step()
+        except (ProblemError, UnsupportedProblem, InvalidSolution) as error:
+            raise SimulationError(f"step {world.steps + 1}: {error}") from error
+        on_step(State(report, schedule.steps, recorder.measures))
+        if world.steps % schedule.frame_every == 0 and until(recorder.measures):
+            return f"what was waited for holds at step {world.steps}"
+    return f"all {schedule.steps} steps are made"
+
+
+class _Recorder:
+    """A world whose every step is written down."""
+
+    def __init__(self, simulation: Simulation, folder: Path, schedule: Schedule) -> None:
+        self._folder, self._schedule, self._scene = folder, schedule, simulation.scene
+        try:
+            self.world = simulation.scene.world(solver=simulation.solver, seed=simulation.seed)
+            kept = folder / CHECKPOINT
+            if kept.exists():
+                resume(self.world, kept.read_bytes())
+        except CheckpointError as error:
+            raise SimulationError(f"{folder / CHECKPOINT}: {error}") from error
+        except ProblemError as error:
+            raise SimulationError(str(error)) from error
+        made = self.world.steps
+        frames = made // schedule.frame_every + 1 if kept.exists() else 0
+        self.measures = dict(self._scene.measure(self.world))
+        self._rows = RowWriter(folder / STEPS, COLUMNS, rows=made)
+        self._measured = RowWriter(folder / MEASURES, ("step", "time", *self.measures), rows=frames)
+        self._trajectory = TrajectoryWriter(folder, frames=frames)
+        if frames == 0:
+            self._frame()
+
+    def step(self) -> StepReport:
+        """Go on by one step."""
+        begin = time.perf_counter()
+        report = self.world.step()
+        wall_s = time.perf_counter() - begin
+        known = asdict(report) | asdict(report.energy) | {"status": report.status.label, "wall_s": wall_s}
+        self._rows.append([known[column] for column in COLUMNS])
+        if self.world.steps % self._schedule.frame_every == 0:
+            self.measures = dict(self._scene.measure(self.world))
+            self._frame()
+        if self.world.steps % self._schedule.checkpoint_every == 0:
+            self.checkpoint()
+        return report
+
+    def checkpoint(self) -> None:
+        """Keep the state. Rows first: a checkpoint never says more than there is."""
+        self._rows.flush()
+        self._measured.flush()
+        replace_file(self._folder / CHECKPOINT, checkpoint(self.world))
+
+    def _frame(self) -> None:
+        world = self.world
+        height = world.container.motion.height(world.time)
+        self._trajectory.append(
+            Frame(
+                world.steps, world.time, height,
+                world.spheres.by_label(world.spheres.place), world.spheres.by_label(world.spheres.velocity),
+            )
+        )  # fmt: skip
+        self._measured.append([world.steps, world.time, *self.measures.values()])
+
+
+class _Probes:
+    """Impacts of single steps, scored as any impact; those that are stored already are not taken again."""
+
+    def __init__(self, simulation: Simulation, store: Store, run: int) -> None:
+        self._simulation, self._store, self._run = simulation, store, run
+
+    def take(self, world: MovingWorld) -> None:
+        """Score the impact that the next step will solve, if it has contacts and is not too large."""
+        solver = self._simulation.solver
+        if isinstance(solver, Streamed):
+            return
+        problem = world.problem()
+        if not 0 < problem.m <= MOST_PROBED:
+            return
+        (number,) = self._store.plan([_task(self._simulation, PROBE, step=world.steps)], run=self._run)
+        if number not in {planned.number for planned in self._store.pending()}:
+            return
+        scenario = _scenario(self._simulation.scene, problem, world.spheres.count, world.steps)
+        begin = time.perf_counter()
+        try:
+            measured = measure_impact(solver, scenario, seed=self._simulation.seed)
+        except UnsupportedProblem as refusal:
+            # The step itself will be refused as well, and end the run; the row says why.
+            self._store.record(number, Ending(Outcome.REFUSED, str(refusal)), run=self._run)
+            return
+        ending = Ending(Outcome.MEASURED, wall_s=time.perf_counter() - begin, measurement=measured)
+        self._store.record(number, ending, run=self._run)
+
+
+def _record_run(simulation: Simulation, folder: Path, store: Store, run: int, *, steps: int) -> None:
+    """Store what holds of all steps together."""
+    if steps == 0:
+        return
+    (number,) = store.plan([_task(simulation, RUN, steps=steps)], run=run)
+    if number in {planned.number for planned in store.pending()}:
+        store.record(number, _whole_run(folder), run=run)
+
+
+def _task(simulation: Simulation, what: str, **more: object) -> PlannedTask:
+    """The whole run, or one probe of it."""
+    scene = simulation.scene
+    parameters = {"of": what, "scene": dict(scene.parameters), **more}
+    task = Task(Kind.SIMULATION, simulation.specification, scene.name, parameters, simulation.seed)
+    label = scene.label + "".join(f", {key} {value}" for key, value in more.items())
+    return PlannedTask(task, {}, label, frozenset({"moving"}))
+
+
+def _scenario(scene: MovingScene, problem: ImpactProblem, bodies: int, step: int) -> Scenario:
+    """The impact of one step as a scenario: what it conserves is read off its contacts."""
+    # Velocity alone, or velocity and spin: vectors in space. Anything else (pendulums) is a coordinate of its own kind.
+    in_space = problem.n in (3 * bodies, 6 * bodies)
+    return Scenario(
+        scene.name, {**scene.parameters, "step": step}, problem, scene.source,
+        invariants=tuple(_momenta(problem, problem.n // bodies)) if in_space else (),
+        tags=frozenset({"moving", "friction"} if problem.has_friction else {"moving"}),
+        dofs_per_body=3 if in_space else 1,
+    )  # fmt: skip
+
+
+def _momenta(problem: ImpactProblem, block: int) -> Iterator[Invariant]:
+    """Linear momenta along the axes that no contact with an immovable body takes away."""
+    for axis, name in enumerate("xyz"):
+        direction = np.zeros(problem.n)
+        direction[axis::block] = 1.0
+        rows = [problem.J] if problem.D is None else [problem.J, problem.D]
+        # A difference of two equal numbers: exactly zero, or a wall.
+        if all(not (matrix @ direction).any() for matrix in rows):
+            yield Invariant(f"momentum {name}", direction)
+
+
+def _whole_run(folder: Path) -> Ending:
+    """What holds of all steps together, from the series."""
+    rows = read_rows(folder / STEPS)
+    column = {name: np.array(rows[name], dtype=np.float64) for name in COLUMNS if name != "status"}
+    scores = [*_energy_scores(column), *_statistics(column), *_last_measures(folder)]
+    unfinished = sum(status != "converged" for status in rows["status"])
+    scores.append(shown("run", "steps whose impact did not converge", unfinished / len(rows["status"])))
+    last = rows["status"][-1]
+    return Ending(
+        Outcome.MEASURED, wall_s=float(column["wall_s"].sum()),
+        measurement=Measurement(last, int(column["iterations"].sum()), int(column["contacts"].sum()), tuple(scores)),
+    )  # fmt: skip
+
+
+def _energy_scores(column: Mapping[str, Floats]) -> Iterator[Score]:
+    """KIN over all steps: work of all impulses over the kinetic energy before them."""
+    work = column["impact"] + column["friction"]
+    before = column["kinetic"] - work
+    change = np.array([ratio(abs(w), k) * math.copysign(1.0, w) for w, k in zip(work, before, strict=True)])
+    worst = int(change.argmax())
+    yield upper_bound(
+        "KIN", "energy gained in an impact", float(max(change[worst], 0.0)), desiderata.ENERGY_TOLERANCE,
+        detail={"step": int(column["step"][worst])},
+    )  # fmt: skip
+    yield shown("KIN", "energy error e, mean over the steps", float(np.abs(change).mean()))
+    total = {name: float(column[name].sum()) for name in ("impact", "friction", "correction", "shaking", "integration")}
+    scale = float(np.abs(column["kinetic"]).max()) or 1.0
+    for name, joule in total.items():
+        yield shown("energy", f"{name}, over the largest kinetic energy", joule / scale)
+
+
+def _statistics(column: Mapping[str, Floats]) -> Iterator[Score]:
+    """Counts and times, as Table 2 of Zhang 2015 gives them."""
+    for name in ("contacts", "iterations", "sweeps", "residual", "overlap", "wall_s"):
+        values = column[name][np.isfinite(column[name])]
+        if values.size == 0:
+            yield not_applicable("run", f"{name}, mean", "the solver does not tell")
+            continue
+        for word, value in (("mean", values.mean()), ("largest", values.max()), ("smallest", values.min())):
+            yield shown("run", f"{name}, {word}", float(value))
+
+
+def _last_measures(folder: Path) -> Iterator[Score]:
+    """The scene's own measures at the last frame."""
+    rows = read_rows(folder / MEASURES)
+    for name, values in rows.items():
+        if name not in ("step", "time"):
+            yield shown("scene", f"{name}, at the end", float(values[-1]))

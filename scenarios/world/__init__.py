@@ -1,0 +1,1 @@
+"""What a moving scene needs: bodies, walls, contacts, impacts, time stepping, checkpoints."""

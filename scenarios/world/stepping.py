@@ -1,0 +1,373 @@
+"""A scene in motion with a fixed step: gravity, contacts, impact, positions.
+
+    v' = v - (g Δt + Δw) e_z               w: velocity of the container, in whose frame all is computed
+    v⁺ = law(v', contacts at x + v' Δt)    one impact, solved by any law
+    x⁺ = x + v⁺ Δt + correction            semi-implicit Euler
+
+Contacts are those that would overlap at the end of the step if nothing held them, so that an impact comes up to a step
+early instead of a step late: spheres that have run into one another would be pushed apart by the correction, which
+lifts a layer and so feeds it. (`extended-pattern` with side=20 and 30 sweeps: in its second cycle the center of the
+layer rises to 10.0 D with 3,200 steps a cycle; with 200 to 9.2 D as here, and to 15.0 D with the contacts at x.)
+
+The correction moves spheres apart that overlap by more than a slop after the step; it changes positions alone, so that
+no kinetic energy comes of it. Its work against gravity is counted by itself.
+
+    K⁺ + U⁺ - K - U = impact + friction + correction + shaking + integration
+
+Every term is measured by itself, in the frame of the container. `integration` is the error of the scheme: for a freely
+falling mass m it is -½ m g² Δt² a step, which a bounce takes back.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from scenarios.world.checkpoint import Arrays, CheckpointError
+from scenarios.world.container import Container
+from scenarios.world.grid import Indices, find_contacts
+from scenarios.world.impact import Impact, Resolver, Restitution
+from scenarios.world.spheres import INVERSE_INERTIA, Spheres
+from scenarios.world.warm_start import NO_IMPULSES, LastImpulses
+from solvers import ImpactProblem, ProblemError, Status
+from solvers._jit import kernel
+from solvers.solution import Floats
+
+# A scene may start with spheres that overlap by this share of the smallest radius: rounding, or a layer made before.
+LARGEST_OVERLAP = 0.02
+# Sweeps of the correction: the rest of an overlap is left to the next steps.
+CORRECTION_SWEEPS = 3
+# Scenes of so many spheres are kept in an order in which neighbors in space are neighbors in memory.
+RENUMBERED = 8_000
+# Steps between two renumberings: a sphere moves about a diameter meanwhile.
+RENUMBER_EVERY = 32
+# Entries of `_sums`.
+KINETIC, MOMENTUM, MASS, FASTEST = range(4)
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What a scene is besides its spheres and walls."""
+
+    step: float
+    """Δt [s]."""
+
+    gravity: float
+    """g [m/s²], down along z."""
+
+    restitution: Restitution
+    friction: float = 0.0
+    """Coefficient of friction of all contacts."""
+
+    largest_move: float = 1.0
+    """Share of the smallest radius that no sphere may exceed in a step: faster ones could pass one another unseen."""
+
+    slop: float = 0.005
+    """Overlap that is left alone, over the smallest radius: contacts of what lies stay contacts."""
+
+    correction: float = 0.3
+    """Share of the overlap beyond the slop that a step takes away."""
+
+
+@dataclass(frozen=True)
+class Ledger:
+    """Energy in the frame of the container, and where it went in a step [J]."""
+
+    kinetic: float
+    potential: float
+    """m g z, zero at z = 0."""
+    impact: float
+    """Work of the normal impulses; restitution makes it negative."""
+    friction: float
+    """Work of the friction impulses."""
+    correction: float
+    """Work of the correction against gravity."""
+    shaking: float
+    """Work of the container's motion."""
+    integration: float
+    """Error of the integration scheme."""
+
+
+@dataclass(frozen=True)
+class StepReport:
+    """What one step came to."""
+
+    step: int
+    """Number of steps made, this one included."""
+    time: float
+    """At the end of the step [s]."""
+    contacts: int
+    status: Status
+    iterations: int
+    """Outer iterations of QCE, or those that the solver reports."""
+    sweeps: int
+    """Sweeps of the LCP with friction."""
+    residual: float
+    """The law's own residual, relative to the largest approach velocity."""
+    overlap: float
+    """Deepest overlap that the step left, over the smallest radius, before the correction."""
+    fastest: float
+    """Largest speed after the step [m/s]."""
+    energy: Ledger
+
+
+@dataclass
+class World:
+    """A scene in motion."""
+
+    identity: str
+    """What scene this is, with all that its trajectory depends on: a checkpoint fits the same identity alone."""
+    spheres: Spheres
+    container: Container
+    settings: Settings
+    resolver: Resolver
+    steps: int = 0
+    """Steps made."""
+
+    def __post_init__(self) -> None:
+        self._last = NO_IMPULSES
+        self._spare_motion, self._spare_place = np.empty_like(self.spheres.motion), np.empty_like(self.spheres.place)
+        self._smallest = float(self.spheres.radius.min())
+        self._sums = _sums(self.spheres.motion)
+        contacts = find_contacts(self.spheres.place, self.container)
+        deepest = int(np.argmin(contacts.gap)) if contacts.m else 0
+        if contacts.m and contacts.gap[deepest] < -LARGEST_OVERLAP * self._smallest:
+            raise ProblemError(
+                f"position: {_pair(contacts.body[deepest], self.spheres.count)} overlap at the start by "
+                f"{-contacts.gap[deepest]:.3g} m, more than {LARGEST_OVERLAP:g} of the smallest radius"
+            )
+
+    @property
+    def time(self) -> float:
+        """Time since the start [s]."""
+        return self.steps * self.settings.step
+
+    @property
+    def period(self) -> float:
+        """Period of the container's motion [s]; inf if it stands still."""
+        return self.container.motion.period
+
+    @property
+    def over(self) -> bool:
+        """A step can always follow."""
+        return False
+
+    def state(self) -> Arrays:
+        """All that changes from step to step."""
+        spheres = self.spheres
+        return {
+            "steps": np.array(self.steps), "place": spheres.place, "motion": spheres.motion, "label": spheres.label,
+            **self._last.state(),
+        }  # fmt: skip
+
+    def restore(self, state: Arrays) -> None:
+        """Go on from a state of the same scene.
+
+        Raises:
+            CheckpointError: an array is missing or has another shape.
+        """
+        own = self.state()
+        for name, array in own.items():
+            # The impulses have as many rows as there were contacts.
+            rows = slice(1, None) if name in self._last.state() else slice(None)
+            if name not in state or state[name].shape[rows] != array.shape[rows] or state[name].dtype != array.dtype:
+                raise CheckpointError(f"the checkpoint's {name} is missing or has another shape than this scene's")
+        self.steps = int(state["steps"])
+        self._last = LastImpulses(state["pair"], state["impulse"])
+        for name in ("place", "motion", "label"):
+            getattr(self.spheres, name)[:] = state[name]
+        self._sums = _sums(self.spheres.motion)
+
+    def problem(self) -> ImpactProblem:
+        """The impact that the next step will solve, as any solver takes it."""
+        return self.impact().problem()
+
+    def step(self) -> StepReport:
+        """Go on by one step. At an error the scene stays as it was before the step.
+
+        Raises:
+            ProblemError: a sphere moves too far in the step, or is lost.
+            UnsupportedProblem: the solver refuses the impact.
+        """
+        impact = self._impact(self._spare_motion, self._spare_place)
+        contacts, motion = impact.contacts, impact.motion
+        u_pre = impact.u_pre
+        outcome = self.resolver.resolve(impact)
+        before, after = self._sums, _sums(motion)
+        self._check_move(float(np.sqrt(after[FASTEST])))
+        shift, overlap = _push_apart(
+            contacts.normal, contacts.body, contacts.gap, u_pre, motion,
+            self.settings.step, self.settings.slop * self._smallest, self.settings.correction,
+        )  # fmt: skip
+        height, lifted = _move(self.spheres.place, motion, self.settings.step, shift)
+        self._spare_motion, self.spheres.motion = self.spheres.motion, motion
+        self._last = outcome.impulses
+        self._sums = after
+        self.steps += 1
+        if self.spheres.count >= RENUMBERED and self.steps % RENUMBER_EVERY == 0:
+            self.spheres.renumber(contacts.order)
+        return StepReport(
+            self.steps,
+            self.time,
+            contacts.m,
+            outcome.status,
+            outcome.iterations,
+            outcome.sweeps,
+            outcome.residual,
+            overlap / self._smallest,
+            float(np.sqrt(after[FASTEST])),
+            self._ledger(before, after, height, lifted, outcome.normal_work),
+        )
+
+    def _kick(self) -> float:
+        """Velocity that the container gains in the next step [m/s]."""
+        motion, now = self.container.motion, self.time
+        return motion.speed(now + self.settings.step) - motion.speed(now)
+
+    def impact(self) -> Impact:
+        """The next step's impact: velocities after gravity and shaking, contacts where these would lead."""
+        return self._impact(np.empty_like(self.spheres.motion), np.empty_like(self.spheres.place))
+
+    def _impact(self, motion: Floats, ahead: Floats) -> Impact:
+        """The next step's impact, in arrays that are there: fresh memory would cost more than what is written to it."""
+        settings = self.settings
+        fall = settings.gravity * settings.step + self._kick()
+        _fall(self.spheres.place, self.spheres.motion, fall, settings.step, motion, ahead)
+        contacts = find_contacts(ahead, self.container)
+        return Impact(contacts, motion, settings.restitution, settings.friction, self.spheres.label, self._last)
+
+    def _check_move(self, fastest: float) -> None:
+        move = fastest * self.settings.step
+        if not np.isfinite(move):
+            raise ProblemError(f"velocity must be finite: it is not after step {self.steps + 1}")
+        if move > self.settings.largest_move * self._smallest:
+            raise ProblemError(
+                f"step: the fastest sphere moves {move:.3g} m in step {self.steps + 1}, more than "
+                f"{self.settings.largest_move:g} of the smallest radius; a shorter step than {self.settings.step:g} s "
+                "is needed"
+            )
+
+    def _ledger(self, before: Floats, after: Floats, height: float, lifted: float, normal_work: float) -> Ledger:
+        """Where the energy of the last step went; `height` is Σ m z after it, `lifted` the correction's share of it."""
+        g, step = self.settings.gravity, self.settings.step
+        # The step is counted already.
+        motion = self.container.motion
+        shaken = motion.speed(self.time) - motion.speed(self.time - step)
+        mass, momentum = before[MASS], before[MOMENTUM]
+        falling = -g * step * momentum + 0.5 * mass * (g * step) ** 2
+        shaking = -shaken * (momentum - mass * g * step) + 0.5 * mass * shaken**2
+        change = after[KINETIC] - (before[KINETIC] + falling + shaking)
+        # Without friction, or where the solver gives no impulses, all of it is the impact's.
+        impact = change if self.settings.friction == 0.0 or np.isnan(normal_work) else normal_work
+        return Ledger(
+            float(after[KINETIC]),
+            g * height,
+            float(impact),
+            float(change - impact),
+            g * lifted,
+            float(shaking),
+            float(falling + g * step * after[MOMENTUM]),
+        )
+
+
+def _pair(body: Indices, spheres: int) -> str:
+    """Name the two bodies of a contact."""
+    return f"sphere {body[1]} and a wall" if body[0] == spheres else f"spheres {body[0]} and {body[1]}"
+
+
+@kernel
+def _fall(place: Floats, motion: Floats, fall: float, step: float, after: Floats, ahead: Floats) -> None:
+    """Velocities after gravity and shaking, and the places to which they lead."""
+    bodies = place.shape[0]
+    for b in range(bodies + 1):
+        for column in range(8):
+            after[b, column] = motion[b, column]
+    for b in range(bodies):
+        after[b, 2] -= fall
+        for axis in range(3):
+            ahead[b, axis] = place[b, axis] + step * after[b, axis]
+        ahead[b, 3] = place[b, 3]
+
+
+@kernel
+def _along(normal: Floats, body: Indices, i: int, vector: Floats) -> float:
+    """Difference of a vector of two bodies along their normal."""
+    a = body[i, 0]
+    b = body[i, 1]
+    return float(
+        normal[i, 0] * (vector[b, 0] - vector[a, 0])
+        + normal[i, 1] * (vector[b, 1] - vector[a, 1])
+        + normal[i, 2] * (vector[b, 2] - vector[a, 2])
+    )
+
+
+@kernel
+def _push_apart(
+    normal: Floats, body: Indices, gap_ahead: Floats, u_pre: Floats, motion: Floats,
+    step: float, slop: float, share: float,
+) -> tuple[Floats, float]:  # fmt: skip
+    """Displacements that take away a share of what overlaps after the step, and the deepest overlap.
+
+    Projected Gauss-Seidel: 0 <= λ complementary to n · Δx - share (overlap - slop) >= 0.
+    """
+    shift = np.zeros((motion.shape[0], 3))
+    deep = np.empty(u_pre.size, np.int32)
+    wanted = np.empty(u_pre.size)
+    count = 0
+    deepest = 0.0
+    for i in range(u_pre.size):
+        # The gap without contacts, less what the impact changed.
+        overlap = -(gap_ahead[i] + step * (_along(normal, body, i, motion) - u_pre[i]))
+        deepest = max(deepest, overlap)
+        if overlap > slop:
+            deep[count] = i
+            wanted[count] = share * (overlap - slop)
+            count += 1
+    push = np.zeros(count)
+    for _ in range(CORRECTION_SWEEPS):
+        for k in range(count):
+            i = deep[k]
+            a = body[i, 0]
+            b = body[i, 1]
+            wa = motion[a, 3]
+            wb = motion[b, 3]
+            change = max((wanted[k] - _along(normal, body, i, shift)) / (wa + wb), -push[k])
+            push[k] += change
+            for axis in range(3):
+                shift[a, axis] -= wa * change * normal[i, axis]
+                shift[b, axis] += wb * change * normal[i, axis]
+    return shift, deepest
+
+
+@kernel
+def _move(place: Floats, motion: Floats, step: float, shift: Floats) -> tuple[float, float]:
+    """New places; returns Σ m z of them, and Σ m Δz of the shift alone."""
+    height = 0.0
+    lifted = 0.0
+    for b in range(place.shape[0]):
+        mass = 1.0 / motion[b, 3]
+        for axis in range(3):
+            place[b, axis] += step * motion[b, axis] + shift[b, axis]
+        height += mass * place[b, 2]
+        lifted += mass * shift[b, 2]
+    return height, lifted
+
+
+@kernel
+def _sums(motion: Floats) -> Floats:
+    """Kinetic energy, vertical momentum, mass, largest speed squared (NaN where any is)."""
+    kinetic = 0.0
+    momentum = 0.0
+    total = 0.0
+    fastest = 0.0
+    for b in range(motion.shape[0] - 1):
+        mass = 1.0 / motion[b, 3]
+        square = motion[b, 0] ** 2 + motion[b, 1] ** 2 + motion[b, 2] ** 2
+        spin = motion[b, 4] ** 2 + motion[b, 5] ** 2 + motion[b, 6] ** 2
+        kinetic += 0.5 * mass * (square + spin / INVERSE_INERTIA)
+        momentum += mass * motion[b, 2]
+        total += mass
+        fastest = max(fastest, square)
+    # NaN is lost in a comparison, not in a sum.
+    return np.array([kinetic, momentum, total, fastest + 0.0 * kinetic])

@@ -1,0 +1,354 @@
+"""Moving scenes with a fixed step: contacts, paths, energy, determinism, checkpoints, errors."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import combinations
+
+import numba
+import numpy as np
+import pytest
+
+from scenarios.granular import falling_gas
+from scenarios.moving import MOVING
+from scenarios.world.checkpoint import CheckpointError, checkpoint, resume
+from scenarios.world.container import Container, Shake, Still, Vibration, box, drum
+from scenarios.world.grid import STRIPES, Contacts, find_contacts
+from scenarios.world.impact import ByProblem, Constant, Impact, Resolver, SlowingRestitution, Streamed
+from scenarios.world.moving_scene import STREAMED
+from scenarios.world.spheres import Spheres, spheres
+from scenarios.world.stepping import Settings, StepReport, World
+from scenarios.world.warm_start import NO_IMPULSES, LastImpulses
+from solvers import SOLVERS, ProblemError, Status, UnsupportedProblem
+from solvers.qce_lcp import QceLcp
+from solvers.solution import Floats
+
+# Two summation orders of the same numbers.
+ROUNDING = 1e-12
+# Both ways solve the same equations, to a residual of 1e-12 of the largest speed; a contact network amplifies it.
+SAME_ANSWER = 1e-8
+TIGHT = 1e-12
+
+
+def gas(count: int = 150, seed: int = 0, width: float = 5.0) -> Spheres:
+    return falling_gas(count, width, np.random.default_rng(seed))
+
+
+def shaken(
+    resolver: Resolver, *, friction: float = 0.5, restitution: float = 0.3, seed: int = 0, step: float = 0.02
+) -> World:
+    settings = Settings(step, 1.0, Constant(restitution), friction)
+    return World("shaken", gas(seed=seed), box(5.0, 5.0, Vibration(0.5, 0.2)), settings, resolver)
+
+
+def run(world: World, steps: int) -> list[StepReport]:
+    return [world.step() for _ in range(steps)]
+
+
+def brute_force(place: Floats, container: Container) -> set[tuple[int, int]]:
+    """Pairs that touch, and (-1, k) for a wall at sphere k, by comparing all with all."""
+    found = {
+        (a, b)
+        for a, b in combinations(range(len(place)), 2)
+        if np.linalg.norm(place[a, :3] - place[b, :3]) <= place[a, 3] + place[b, 3]
+    }
+    for k, (x, y, z, radius) in enumerate(place):
+        found |= {(-1, k) for p in container.planes if p[:3] @ (x, y, z) - p[3] <= radius}
+        found |= {(-1, k) for d in container.drums if d[2] - np.hypot(x - d[0], y - d[1]) <= radius}
+    return found
+
+
+def as_set(contacts: Contacts, bodies: int) -> set[tuple[int, int]]:
+    pairs = [(int(min(a, b)), int(max(a, b))) for a, b in contacts.body]
+    return {(a, b) if b < bodies else (-1, a) for a, b in pairs}
+
+
+@pytest.mark.kernels
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("container", [box(4.0, 3.0, Still()), drum(3.0), Container()])
+def test_contacts_are_those_of_comparing_all_with_all(seed: int, container: Container) -> None:
+    random = np.random.default_rng(seed)
+    place = np.column_stack([random.uniform(0.2, 3.0, (60, 3)), random.uniform(0.2, 0.4, 60)])
+    contacts = find_contacts(place, container)
+    assert as_set(contacts, len(place)) == brute_force(place, container)
+    assert np.abs(np.linalg.norm(contacts.normal, axis=1) - 1.0).max() <= ROUNDING
+
+
+def test_a_lone_sphere_far_away_is_no_trouble() -> None:
+    place = np.array([[0.0, 0.0, 0.0, 0.5], [0.9, 0.0, 0.0, 0.5], [1e6, -1e6, 0.0, 0.5]])
+    assert as_set(find_contacts(place, Container()), 3) == {(0, 1)}
+
+
+@pytest.mark.parametrize("width", [3.0, 6.0, 9.0, 12.0, 30.0])
+def test_stripes_of_one_parity_share_no_movable_body(width: float) -> None:
+    # Fewer rows than stripes, about as many, and more.
+    place = gas(int(5.5 * width * width), width=width).place.copy()
+    place[:, 3] *= 1.6
+    contacts = find_contacts(place, box(width, width, Still()))
+    assert contacts.m > len(place)
+    for parity in (0, 1):
+        seen: set[int] = set()
+        for k in range(parity, STRIPES, 2):
+            own = set(contacts.body[contacts.stripe[k] : contacts.stripe[k + 1]].ravel().tolist()) - {len(place)}
+            assert not own & seen
+            seen |= own
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.5])
+def test_the_packed_way_and_the_problem_give_the_same_step(friction: float) -> None:
+    world = shaken(Streamed(20_000, TIGHT), friction=friction)
+    compared = 0
+    for _ in range(150):
+        impact = world.impact()
+        other = replace(impact, motion=impact.motion.copy())
+        outcome = ByProblem(QceLcp(tolerance=TIGHT)).resolve(other)
+        packed = world.impact()
+        assert Streamed(20_000, TIGHT).resolve(packed).status is Status.CONVERGED
+        assert outcome.status is Status.CONVERGED
+        # With friction the impulses need not be unique, the velocity of a resting network neither: compare the moment
+        # before contacts chain up.
+        if friction == 0.0 or impact.contacts.m <= MOST_COMPARED:
+            speed = np.abs(impact.u_pre).max(initial=1e-3)
+            assert np.abs(packed.motion - other.motion).max() <= SAME_ANSWER * speed
+            compared += impact.contacts.m
+        world.step()
+    assert compared > 500
+
+
+# Up to so many contacts in this gas the friction has one answer; beyond, loops of contacts may lock in several ways.
+MOST_COMPARED = 60
+
+
+def test_the_problem_of_a_step_is_that_step_and_can_be_replayed_alone() -> None:
+    world = shaken(ByProblem(QceLcp()))
+    run(world, 60)
+    problem = world.problem()
+    before = world.steps
+    v_post = SOLVERS["qce-lcp"]().solve(problem).v_post.reshape(-1, 6)
+    world.step()
+    assert world.steps == before + 1
+    assert np.array_equal(v_post[:, :3], world.spheres.velocity)
+    assert np.array_equal(v_post[:, 3:], world.spheres.spin)
+
+
+@pytest.mark.parametrize("name", ["lcp-pgs", "gr", "gauss-seidel", "qce-lcp"])
+def test_other_solvers_take_the_same_scene(name: str) -> None:
+    world = shaken(ByProblem(SOLVERS[name]()), friction=0.0, restitution=1.0)
+    for report in run(world, 80):
+        assert report.status is Status.CONVERGED
+        assert report.energy.impact <= 1e-9 * max(report.energy.kinetic, 1.0)
+
+
+def energy(spheres: Spheres, gravity: float) -> float:
+    mass = 1.0 / spheres.inverse_mass
+    square = (spheres.velocity**2).sum(axis=1) + (spheres.spin**2).sum(axis=1) / 2.5
+    return float(0.5 * mass @ square + gravity * mass @ spheres.position[:, 2])
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.5])
+def test_the_ledger_closes_and_nothing_but_shaking_adds_energy(friction: float) -> None:
+    world = shaken(Streamed(300, 1e-9), friction=friction)
+    scale = energy(world.spheres, 1.0)
+    touched = 0
+    for _ in range(200):
+        before = energy(world.spheres, 1.0)
+        report = world.step()
+        ledger = report.energy
+        change = energy(world.spheres, 1.0) - before
+        entered = ledger.impact + ledger.friction + ledger.correction + ledger.shaking + ledger.integration
+        assert change == pytest.approx(entered, abs=ROUNDING * scale)
+        assert ledger.kinetic + ledger.potential == pytest.approx(before + change, rel=ROUNDING)
+        assert ledger.impact <= 1e-9 * scale
+        assert ledger.friction <= 1e-9 * scale
+        touched += report.contacts
+    assert touched > 1000
+
+
+def pair_at(distance: float) -> Spheres:
+    """Two spheres of diameter 1."""
+    return spheres([[0.0, 0.0, 5.0], [distance, 0.0, 5.0]], 0.5, 1.0)
+
+
+@pytest.mark.kernels
+def test_the_correction_changes_positions_alone() -> None:
+    world = World("pair", pair_at(0.991), Container(), Settings(0.01, 0.0, Constant(0.0)), Streamed())
+    reports = run(world, 40)
+    assert all(report.energy.kinetic == 0.0 for report in reports)
+    gap = world.spheres.position[1, 0] - world.spheres.position[0, 0] - 1.0
+    assert -0.006 * 0.5 <= gap <= 0.0
+
+
+def test_a_falling_sphere_bounces_to_the_height_of_its_restitution() -> None:
+    ball = spheres([[2.0, 2.0, 1.5]], 0.5, 1.0)
+    settings = Settings(1e-3, 1.0, Constant(0.6))
+    world = World("bounce", ball, box(4.0, 4.0, Still()), settings, ByProblem(QceLcp()))
+    heights = []
+    for _ in range(3000):
+        world.step()
+        heights.append(world.spheres.position[0, 2] - 0.5)
+    landed = int(np.argmin(heights[:2000]))
+    # The step puts the impact at most Δt early: 2 v Δt of height.
+    assert max(heights[landed:]) == pytest.approx(0.36, abs=4e-3)
+
+
+@pytest.mark.kernels
+def test_a_rolling_start_ends_without_slip_as_a_solid_sphere_does() -> None:
+    # v -> 5/7 v for a solid sphere that is thrown flat on a rough floor.
+    ball = spheres([[2.0, 2.0, 0.5]], 0.5, 1.0, [[0.5, 0.0, 0.0]])
+    world = World("roll", ball, box(9.0, 4.0, Still()), Settings(0.01, 1.0, Constant(0.0), 0.5), Streamed(50, 1e-9))
+    run(world, 100)
+    assert world.spheres.velocity[0, 0] == pytest.approx(5.0 / 14.0, rel=1e-9)
+    # ω points along +y for a ball that rolls along +x.
+    assert world.spheres.spin[0, 1] == pytest.approx(5.0 / 14.0, rel=1e-9)
+
+
+def test_a_slow_impact_keeps_more_than_a_fast_one() -> None:
+    e = SlowingRestitution().of(np.array([0.0, 0.5, 1.0, 5.0]))
+    assert e[0] == 1.0
+    assert e[1] == pytest.approx(1.0 - 0.3 * 0.5**0.75)
+    assert e[2] == pytest.approx(0.7)
+    assert e[3] == 0.7
+
+
+def test_a_resting_contact_takes_nothing_back() -> None:
+    assert Constant(0.5, resting=0.1).of(np.array([0.05, 0.2])).tolist() == [0.0, 0.5]
+
+
+def test_a_smooth_shake_begins_and_ends_at_rest() -> None:
+    shake = Shake(2.0, 3.0, 1.0)
+    assert [shake.height(t) for t in (0.0, 1.0, 2.5, 4.0, 9.0)] == pytest.approx([0.0, 0.0, 2.0, 0.0, 0.0])
+    assert [shake.speed(t) for t in (0.0, 1.0, 2.5, 4.0, 9.0)] == pytest.approx([0.0] * 5, abs=1e-15)
+    times = np.linspace(0.0, 5.0, 5001)
+    slopes = np.gradient([shake.height(t) for t in times], times)
+    # The acceleration jumps by ½ A (2π/T)² at both ends: a difference over two steps misses a quarter step of it.
+    jump = 0.5 * 2.0 * (2.0 * np.pi / 3.0) ** 2
+    assert np.abs(slopes - [shake.speed(t) for t in times]).max() < 0.3 * 1e-3 * jump
+
+
+def test_last_impulses_are_found_again_under_any_order_and_numbering() -> None:
+    last = LastImpulses(np.array([[0, 3], [5, 1], [6, 2]], dtype=np.int32), np.arange(9.0).reshape(3, 3))
+    found = last.at(np.array([[1, 5], [2, 3], [3, 0], [6, 2]], dtype=np.int32))
+    assert found.tolist() == [[3.0, 4.0, 5.0], [0.0] * 3, [0.0, 1.0, 2.0], [6.0, 7.0, 8.0]]
+    assert NO_IMPULSES.at(np.array([[1, 5]], dtype=np.int32)).tolist() == [[0.0] * 3]
+
+
+def test_what_lies_starts_from_the_last_step() -> None:
+    # A pile of eight on one another, held by walls on all sides: from zero each sweep reaches one sphere further.
+    pile = spheres([[0.5, 0.5, 0.5 + k] for k in range(8)], 0.5, 1.0)
+    lying = Settings(0.01, 1.0, Constant(0.5, resting=0.1), 0.3)
+    world = World("pile", pile, box(1.0, 1.0, Still()), lying, Streamed(10, 1e-9))
+    residuals = [report.residual for report in run(world, 60)]
+    assert residuals[0] > 1e-2
+    assert residuals[-1] < 1e-4 * residuals[0]
+    weights = world._last.impulse[:, 0]
+    # The floor carries all eight.
+    assert weights.max() == pytest.approx(8 * 0.01, rel=1e-3)
+
+
+def small_pattern(seed: int = 3) -> World:
+    world = MOVING["extended-pattern"](side=6, steps_per_cycle=200).world(seed=seed)
+    assert isinstance(world, World)
+    return world
+
+
+def test_the_same_seed_gives_the_same_trajectory_on_any_number_of_threads() -> None:
+    ends = []
+    threads = numba.get_num_threads()
+    try:
+        for count in (1, threads):
+            numba.set_num_threads(count)
+            world = small_pattern()
+            run(world, 300)
+            ends.append(world.state())
+    finally:
+        numba.set_num_threads(threads)
+    assert ends[0]["steps"] == 300
+    for name in ends[0]:
+        assert np.array_equal(ends[0][name], ends[1][name]), name
+    assert not np.array_equal(ends[0]["place"], small_pattern(seed=4).state()["place"])
+
+
+def test_a_resumed_run_goes_on_bit_for_bit() -> None:
+    whole = small_pattern()
+    run(whole, 120)
+    content = checkpoint(whole)
+    resumed = small_pattern()
+    resume(resumed, content)
+    assert resumed.steps == 120
+    assert run(resumed, 130) == run(whole, 130)
+    assert checkpoint(resumed) == checkpoint(whole)
+
+
+def test_a_checkpoint_of_another_scene_or_format_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    content = checkpoint(small_pattern())
+    with pytest.raises(CheckpointError, match=r"seed 3[^Σ]*seed 4"):
+        resume(small_pattern(seed=4), content)
+    with pytest.raises(CheckpointError, match="not a checkpoint"):
+        resume(small_pattern(), b"something else")
+    with pytest.raises(CheckpointError, match="not a checkpoint"):
+        resume(small_pattern(), content[: len(content) // 2])
+    monkeypatch.setattr("scenarios.world.checkpoint.FORMAT", 2)
+    with pytest.raises(CheckpointError, match="format 1; this version reads format 2"):
+        resume(small_pattern(), content)
+
+
+def test_a_step_too_large_is_refused_and_changes_nothing() -> None:
+    fast = spheres([[2.0, 2.0, 2.0]], 0.5, 1.0, [[0.0, 0.0, -60.0]])
+    world = World("fast", fast, box(4.0, 4.0, Still()), Settings(0.01, 1.0, Constant(0.5)), Streamed())
+    before = world.spheres.place.copy()
+    with pytest.raises(ProblemError, match=r"step: the fastest sphere moves 0\.6 m in step 1"):
+        world.step()
+    assert np.array_equal(world.spheres.place, before)
+    assert world.steps == 0
+
+
+def test_an_overlapping_start_is_refused() -> None:
+    with pytest.raises(ProblemError, match=r"spheres 0 and 1 overlap at the start by 0\.2 m"):
+        World("overlap", pair_at(0.8), Container(), Settings(0.01, 1.0, Constant(0.5)), Streamed())
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({"velocity": [[np.nan, 0.0, 0.0]]}, "velocity must be finite: sphere 0"),
+        ({"position": [[np.inf, 0.0, 0.0]]}, "position must be finite: sphere 0"),
+        ({"radius": 0.0}, "radius must be finite and > 0"),
+        ({"mass": [1.0, 2.0]}, r"mass must be a number or have shape \(1,\)"),
+        ({"position": [[0.0, 0.0]]}, r"position must have shape \(bodies, 3\)"),
+    ],
+)
+def test_bad_spheres_are_refused_by_name(changed: dict[str, object], words: str) -> None:
+    good: dict[str, object] = {"position": [[0.0, 0.0, 0.0]], "radius": 0.5, "mass": 1.0, "velocity": None}
+    with pytest.raises(ProblemError, match=words):
+        spheres(**{**good, **changed})  # type: ignore[arg-type]
+
+
+def test_a_velocity_that_became_nan_stops_the_run() -> None:
+    world = shaken(Streamed())
+    world.spheres.motion[3, 1] = np.nan
+    with pytest.raises(ProblemError, match="must be finite"):
+        world.step()
+
+
+def test_a_solver_that_refuses_friction_says_so() -> None:
+    world = shaken(ByProblem(SOLVERS["qce"]()))
+    with pytest.raises(UnsupportedProblem, match="qce"):
+        run(world, 100)
+
+
+def test_an_unknown_solver_is_refused_with_the_names() -> None:
+    with pytest.raises(ProblemError, match=r"solver must be one of .*qce-lcp-fast.*, not 'qcee'"):
+        MOVING["extended-pattern"](side=6).world(solver="qcee")
+
+
+def test_streamed_settings_have_names_that_are_no_solvers() -> None:
+    assert not set(STREAMED) & set(SOLVERS)
+    assert list(STREAMED) == sorted(STREAMED)
+
+
+def test_an_impact_without_contacts_changes_nothing() -> None:
+    still = spheres([[0.0, 0.0, 0.0]], 0.5, 1.0, [[1.0, 2.0, 3.0]])
+    for resolver in (Streamed(), ByProblem(QceLcp())):
+        impact = Impact(find_contacts(still.place, Container()), still.motion.copy(), Constant(0.5), 0.0, still.label)
+        assert resolver.resolve(impact).status is Status.CONVERGED
+        assert np.array_equal(impact.motion, still.motion)
