@@ -66,6 +66,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from solvers.boxed_lcp import MAX_VISITS
 from solvers.compression import pair_duration
 from solvers.explicit_hertz_rows import Rows, rows
 from solvers.explicit_hertz_spheres import Spheres, spheres
@@ -105,6 +106,9 @@ class ExplicitHertz:
 
     max_steps: int = 1_000_000
     """Bound on the shortest steps."""
+
+    max_visits: int = MAX_VISITS
+    """Bound on contact visits, looked at once a step."""
 
     def __post_init__(self) -> None:
         if not self.steps_per_contact >= 1.75:
@@ -152,6 +156,7 @@ class ExplicitHertz:
             v_end, P, P_t, rubbed, taken, seen, finished = contacts.integrate(
                 v, exponent=self.exponent, h=refinement * self._step(contacts, V), gap_memory=gap_memory,
                 threshold=threshold, slowest=max(WAIT * V, threshold), max_steps=self.max_steps - steps,
+                max_visits=self.max_visits - visits,
             )  # fmt: skip
             u_end = contacts.relative_velocity(v_end)
             steps += taken
@@ -161,7 +166,7 @@ class ExplicitHertz:
             root = math.copysign(math.sqrt(max(a * a - 2.0 * b * rubbed, 0.0)), a + b)
             scale = 1.0 if b <= 0.0 else max((root - a) / b, 0.0)
             small = abs(scale - 1.0) <= LARGEST_CORRECTION
-            if not small and refinement > FINEST and steps < self.max_steps:
+            if not small and refinement > FINEST and steps < self.max_steps and visits < self.max_visits:
                 refinement *= 0.5
                 finished = True
                 continue
@@ -183,12 +188,13 @@ class ExplicitHertz:
         v_end, P, P_t, _, steps, visits, finished = contacts.integrate(
             v, exponent=self.exponent, h=self._step(contacts, 1.0), gap_memory=gap_memory,
             threshold=threshold, slowest=math.inf, max_steps=self.max_steps,
+            max_visits=self.max_visits,
         )  # fmt: skip
         u, u_end = contacts.relative_velocity(v), contacts.relative_velocity(v_end)
         a, b = _powers(P, u, u_end, P_t, contacts.slip(v), contacts.slip(v_end))
         scale = min(-2.0 * a / b, 1.0) if b > 0.0 else 1.0
         v = v + scale * (v_end - v)
-        most = min(MOST_SWEEPS, self.max_steps - steps)
+        most = min(MOST_SWEEPS, self.max_steps - steps, max(self.max_visits - visits, 0) // u.size)
         _, rest, sweeps, settled = contacts.settle(v, threshold=threshold, max_steps=most)
         visits += sweeps * rest.size
         return scale * P + rest, scale * P_t, steps + sweeps, visits, finished and settled

@@ -76,7 +76,7 @@ class Rows:
 
     def integrate(
         self, v: Floats, *, exponent: float, h: float, gap_memory: float, threshold: float, slowest: float,
-        max_steps: int,
+        max_steps: int, max_visits: int,
     ) -> tuple[Floats, Floats, Floats, float, int, int, bool]:  # fmt: skip
         """One round from v with the shortest step h; gap_memory = 1 remembers nothing.
 
@@ -92,7 +92,7 @@ class Rows:
             D.indptr, D.indices, D.data, problem.DM.indptr, problem.DM.indices, self.DM,
             *_levels(problem, self.rate, exponent), self.stiffness, self.stiffness / self.rate,
             problem.restitution, problem.friction, self.slip_bound,
-            exponent, h, gap_memory, threshold, slowest, max_steps, v, P, P_t,
+            exponent, h, gap_memory, threshold, slowest, max_steps, max_visits, v, P, P_t,
         )  # fmt: skip
         return v, P, P_t, rubbed, steps, visits, finished
 
@@ -308,7 +308,7 @@ def _round(
     D_start: Ints, D_index: Ints, D: Floats, DM_start: Ints, DM_index: Ints, DM: Floats,
     level: Ints, order: Ints, reached: Ints, v_level: Ints, v_order: Ints, v_reached: Ints,
     stiffness: Floats, inertia: Floats, restitution: Floats, friction: Floats, slip_bound: Floats,
-    exponent: float, h: float, gap_memory: float, threshold: float, slowest: float, max_steps: int,
+    exponent: float, h: float, gap_memory: float, threshold: float, slowest: float, max_steps: int, max_visits: int,
     v: Floats, P: Floats, P_t: Floats,
 ) -> tuple[float, int, int, bool]:  # fmt: skip
     """One round; changes v, P, P_t. Returns the energy that friction took, steps, contact visits, finished."""
@@ -337,7 +337,7 @@ def _round(
     tick = 0
     steps = 0
     visits = 0
-    while steps < max_steps:
+    while steps < max_steps and visits < max_visits:
         steps += 1
         reach = 0
         while reach < top and (tick >> reach) & 1 == 0:

@@ -64,7 +64,7 @@ class Spheres:
 
     def integrate(
         self, v: Floats, *, exponent: float, h: float, gap_memory: float, threshold: float, slowest: float,
-        max_steps: int,
+        max_steps: int, max_visits: int,
     ) -> tuple[Floats, Floats, Floats, float, int, int, bool]:  # fmt: skip
         """One round from v; gap_memory = 1 remembers nothing.
 
@@ -75,7 +75,7 @@ class Spheres:
         P = np.zeros(self.rate.size)
         steps, visits, finished = _round(
             self.chunk, self.bodies_of_chunk, self.rows.normal, self.rows.body, self.stiffness,
-            self.stiffness / self.rate, exponent, h, gap_memory, threshold, slowest, max_steps, v, P,
+            self.stiffness / self.rate, exponent, h, gap_memory, threshold, slowest, max_steps, max_visits, v, P,
         )  # fmt: skip
         return v, P, np.zeros(0), 0.0, steps, visits, finished
 
@@ -247,7 +247,7 @@ def _close_next_gap(normal: Floats, body: Indices, V: Floats, threshold: float, 
 @parallel_kernel
 def _round(
     chunk: Offsets, size: int, normal: Floats, body: Indices, stiffness: Floats, inertia: Floats,
-    exponent: float, h: float, gap_memory: float, threshold: float, slowest: float, max_steps: int,
+    exponent: float, h: float, gap_memory: float, threshold: float, slowest: float, max_steps: int, max_visits: int,
     V: Floats, P: Floats,
 ) -> tuple[int, int, bool]:  # fmt: skip
     """One round; changes V and P. Returns steps, contact visits, finished."""
@@ -268,7 +268,7 @@ def _round(
     peak = 0.0
     steps = 0
     visits = 0
-    while steps < max_steps:
+    while steps < max_steps and visits < max_visits:
         steps += 1
         for parity in range(2):
             for half in prange((chunks + 1 - parity) // 2):

@@ -60,14 +60,10 @@ class SlowingRestitution:
     floor: float = 0.7
     """e from the speed on at which the curve reaches it."""
 
-    resting: float = 0.0
-    """Speed below which an impact is none and takes nothing back [m/s]: gravity's in a step, for what lies."""
-
     def of(self, speed: Floats) -> Floats:
         """c_r for speeds ≥ 0 [m/s], shape (m,)."""
         root = np.sqrt(speed)
-        e = np.maximum(1.0 - self.loss * root * np.sqrt(root), self.floor)
-        return np.where(speed < self.resting, 0.0, e)
+        return np.maximum(1.0 - self.loss * root * np.sqrt(root), self.floor)
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,9 @@
 
 Contacts are those that would overlap at the end of the step if nothing held them, so that an impact comes up to a step
 early instead of a step late: spheres that have run into one another would be pushed apart by the correction, which
-lifts a layer and so feeds it. (`extended-pattern` with side=20 and 30 sweeps: in its second cycle the center of the
-layer rises to 10.0 D with 3,200 steps a cycle; with 200 to 9.2 D as here, and to 15.0 D with the contacts at x.)
+lifts a layer and so feeds it. (Trial with 2,400 grains under the driving of hexagons, 30 sweeps: in the middle of the
+second cycle the center of the layer is at 10.0 D with 3,200 steps a cycle and the contacts at x; with 200 steps it is
+at 15.0 D with the contacts at x, and at 9.2 D as here.)
 
 The correction moves spheres apart that overlap by more than a slop after the step; it changes positions alone, so that
 no kinetic energy comes of it. Its work against gravity is counted by itself.

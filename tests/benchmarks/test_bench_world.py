@@ -1,9 +1,9 @@
 """A whole step of 60,000 vibrated grains, and what it is made of; `pytest -m long tests/benchmarks`.
 
-μ = 0.5, c_r = 0.3 or the scene's own restitution that depends on speed; 200 steps a cycle, over the two cycles in which
-a pattern repeats, after two that settle it. The iterations stand beside Table 2 of Zhang 2015 (average / maximum /
-minimum: squares 13/46/1, stripes 17/44/1, hexagons 12/33/1; seconds in contact resolving, average / maximum, on one
-thread of a 3.0 GHz i5-2320: 0.28/2.74, 0.33/4.39, 0.25/2.87).
+μ = 0.5, c_r = 0.3 or the scene's own restitution that depends on speed; over the two cycles in which a pattern repeats,
+after two that settle it. The iterations stand beside Table 2 of Zhang 2015 (average / maximum / minimum: squares
+13/46/1, stripes 17/44/1, hexagons 12/33/1; seconds in contact resolving, average / maximum, on one thread of a 3.0 GHz
+i5-2320: 0.28/2.74, 0.33/4.39, 0.25/2.87).
 """
 
 from __future__ import annotations
@@ -26,7 +26,6 @@ from scenarios.world.stepping import StepReport, World
 
 pytestmark = pytest.mark.long
 
-STEPS_PER_CYCLE = 200
 CYCLES = 2
 PARTS = {
     "pairs": (stepping, "find_contacts"),
@@ -60,12 +59,17 @@ class Stopwatch:
 
 
 def settled(pattern: str, restitution: float | None) -> World:
-    scene = extended_pattern(pattern=pattern, steps_per_cycle=STEPS_PER_CYCLE, restitution=restitution)
-    world = scene.world()
+    """A scene after two cycles."""
+    world = extended_pattern(pattern=pattern, restitution=restitution).world()
     assert isinstance(world, World)
-    for _ in range(2 * STEPS_PER_CYCLE):
+    for _ in range(steps_of(world)):
         world.step()
     return world
+
+
+def steps_of(world: World) -> int:
+    """Steps in the two cycles in which a pattern repeats."""
+    return round(CYCLES * world.period / world.settings.step)
 
 
 @pytest.mark.parametrize("threads", [1, 2])
@@ -81,14 +85,18 @@ def test_step(
     watch = Stopwatch(monkeypatch)
     reports: list[StepReport] = []
     numba.set_num_threads(threads)
-    steps = CYCLES * STEPS_PER_CYCLE
+    steps = steps_of(world)
+    cpu = time.process_time()
     try:
         benchmark.pedantic(lambda: reports.append(world.step()), rounds=steps)
     finally:
         numba.set_num_threads(available)
+    cpu = time.process_time() - cpu
     iterations = np.array([report.iterations for report in reports])
     benchmark.extra_info.update(
         {f"{part}_ms": 1e3 * spent / steps for part, spent in watch.spent.items()},
+        # Of all threads together: what other processes on the machine disturb least.
+        cpu_ms=1e3 * cpu / steps,
         mean_ms=1e3 * benchmark.stats.stats.mean,
         max_ms=1e3 * benchmark.stats.stats.max,
         contacts=float(np.mean([report.contacts for report in reports])),
@@ -106,8 +114,8 @@ def test_error_of_few_sweeps(benchmark: Any, restitution: float | None, sweeps: 
     world = settled("hexagons", restitution)
     errors = []
     residuals = []
-    for step in range(CYCLES * STEPS_PER_CYCLE):
-        if step % (CYCLES * STEPS_PER_CYCLE // SAMPLES) == 0:
+    for step in range(steps_of(world)):
+        if step % (steps_of(world) // SAMPLES) == 0:
             fast = world.impact()
             accurate = replace(fast, motion=fast.motion.copy())
             Streamed(max_sweeps=sweeps).resolve(fast)
