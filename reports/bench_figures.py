@@ -165,7 +165,8 @@ def draw_lcp_methods(points: Sequence[Point]) -> Figure:
 
 def draw_scaling(points: Sequence[Point]) -> Figure:
     """CPU time over contacts, one panel a family, with the fitted exponents in the legend."""
-    families = list(dict.fromkeys(point.family for point in points))
+    # An interrupted bench has families without any time yet.
+    families = list(dict.fromkeys(point.family for point in points if point.timed))
     entries = len(_known(points, BENCH_LOOKS)) + 2
     figure = Figure(figsize=(TWO_COLUMNS, 2.7 + LEGEND_LINE * entries), layout="constrained")
     panels = np.atleast_1d(figure.subplots(1, len(families), sharey=True))

@@ -13,6 +13,7 @@ from harness.measurement import Kind, Measurement, Outcome, Score, Series, Task,
 from harness.store import Ending, PlannedTask, Store
 from harness.work_precision import COLD, ERRORS, SCALING, TIMES, VERIFICATION, WARM
 from reports.bench import NOT_REACHED, bench_markdown, write_bench
+from reports.bench_figures import figures
 from reports.bench_rows import Bench, cost_matrix, exponent, is_own_reference, laws, reach, scenes, sweep
 from reports.scorecard import ReportError
 
@@ -222,6 +223,14 @@ def test_an_open_task_makes_the_page_incomplete(making: Making) -> None:
     making.task(SCALING, "qce", "sphere-pack", contacts=100, parameters={"spheres": 100})
     text = page(making)
     assert "**INCOMPLETE: 2 planned tasks are not done.**" in text
+
+
+def test_an_interrupted_bench_can_be_drawn(making: Making) -> None:
+    making.growth()
+    # A family of which nothing was timed yet.
+    making.task(SCALING, "qce", "newtons-cradle", contacts=100, parameters={"balls": 101})
+    figure = figures(Bench(making.store))["bench_scaling"]()
+    assert [panel.get_title(loc="left") for panel in figure.axes] == ["(a) sphere-pack, kick"]
 
 
 def test_hertz_is_not_judged_by_its_own_answer() -> None:
