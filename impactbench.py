@@ -381,7 +381,7 @@ def simulate(
             _say(f"\ninterrupted; the same command goes on:\n  {_command_line(without='--fresh')}")
             sys.exit(EXIT_INTERRUPTED)
         _say(why)
-        _write_simulation(out, color=chosen.color, pictures=pictures, video=video)
+        _write_simulation(out, chosen, pictures=pictures, video=video)
 
 
 def _wanted_steps(scene: MovingScene, steps: int | None, cycles: int | None) -> int:
@@ -395,14 +395,16 @@ def _wanted_steps(scene: MovingScene, steps: int | None, cycles: int | None) -> 
     return cycles * scene.steps_per_cycle
 
 
-def _write_simulation(out: Path, *, color: str, pictures: bool, video: bool) -> None:
+def _write_simulation(out: Path, scene: MovingScene, *, pictures: bool, video: bool) -> None:
     from reports.pictures import View
     from reports.simulation import write_pictures, write_simulation
 
     with _open(out) as store:
         written = write_simulation(store, out)
     if pictures or video:
-        written += write_pictures(out, color=color, video=video, view=View(), progress=_say)
+        written += write_pictures(
+            out, color=scene.color, color_from=scene.color_from, video=video, view=View(), progress=_say
+        )
     click.echo((out / "simulation.md").read_text(encoding="utf-8"))
     click.echo("written: " + ", ".join(str(path) for path in written if path.suffix in (".md", ".png", ".mp4")))
 

@@ -26,7 +26,7 @@ DPI = 100
 # Frames a second of a video.
 RATE = 25
 # Eye's distance over the diagonal of the stage, and the angle it sees [degrees]: the diagonal just fits.
-DISTANCE, VIEW_ANGLE = 1.5, 30.0
+DISTANCE, VIEW_ANGLE = 1.9, 30.0
 EDGE = 0.15
 """Width of a disc's dark rim, in points: it tells neighbors of the same color apart."""
 

@@ -116,13 +116,20 @@ def simulation_markdown(store: Frames, series: Mapping[str, Floats]) -> str:
 
 
 def write_pictures(
-    folder: Path, *, color: str, video: bool, view: pictures.View, progress: Callable[[str], None]
+    folder: Path,
+    *,
+    color: str,
+    color_from: float = 0.0,
+    video: bool,
+    view: pictures.View,
+    progress: Callable[[str], None],
 ) -> list[Path]:
     """Draw stills of a simulation, and a video if it is wanted.
 
     Args:
         folder: with frames.
-        color: what the color shows: "height [m]", "depth at the start [m]" or "speed [m/s]".
+        color: what the color shows: "height [m]", "depth [m]" or "speed [m/s]".
+        color_from: time of the frame that the depth is taken from [s]; the last frame where none is as late.
         video: also write simulation.mp4.
         view: from where.
         progress: told what is drawn.
@@ -133,7 +140,7 @@ def write_pictures(
     steps = [frame.step for frame in trajectory.read_frames(folder)]
     if not steps:
         raise ReportError(f"{folder} holds no frames")
-    paint = _painter(folder, color)
+    paint = _painter(folder, color, color_from)
     stage = pictures.stage_of((paint(frame) for frame in trajectory.read_frames(folder)), color)
     wanted = {steps[k] for k in np.linspace(0, len(steps) - 1, STILLS).round().astype(int)}
     written = []
@@ -150,13 +157,16 @@ def write_pictures(
     return written
 
 
-def _painter(folder: Path, color: str) -> Callable[[trajectory.Frame], pictures.Frame]:
+def _painter(folder: Path, color: str, color_from: float) -> Callable[[trajectory.Frame], pictures.Frame]:
     """Give each sphere its color, and each frame its title."""
-    first = next(trajectory.read_frames(folder))
-    depth = first.place[:, 2].max() - first.place[:, 2]
+    for frame in trajectory.read_frames(folder):
+        depth = frame.place[:, 2].max() - frame.place[:, 2]
+        # Times are sums of steps.
+        if frame.time >= color_from * (1.0 - 1e-9):
+            break
     shown: dict[str, Callable[[trajectory.Frame], Floats]] = {
         "height [m]": lambda frame: frame.place[:, 2],
-        "depth at the start [m]": lambda _: depth,
+        "depth [m]": lambda _: depth,
         "speed [m/s]": lambda frame: np.linalg.norm(frame.velocity, axis=1),
     }
     if color not in shown:

@@ -181,7 +181,8 @@ def granular_shake(
         partial(_start, Shake(amplitude, duration, SETTLED), grains, side, settings),
         default_solver="qce-lcp-fast",
         default_steps=round((SETTLED + duration + AFTERWARDS) / step),
-        color="depth at the start [m]",
+        color="depth [m]",
+        color_from=SETTLED,
     )
 
 

@@ -125,7 +125,10 @@ class MovingScene:
     """Whether its measures show what the scene is for: a pattern that stands."""
 
     color: str = "height [m]"
-    """What pictures show by color: "height [m]", "depth at the start [m]" or "speed [m/s]"."""
+    """What pictures show by color: "height [m]", "depth [m]" or "speed [m/s]"."""
+
+    color_from: float = 0.0
+    """Time from which the depth is taken for good [s]: when a layer has come to rest."""
 
     @property
     def label(self) -> str:
