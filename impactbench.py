@@ -783,7 +783,8 @@ def _write_reports(out: Path, write: Callable[[Store, Path], list[Path]]) -> Non
 
     with _open(out) as store:
         console = _console()
-        render_terminal(add_up(store), console)
+        if not _only_hard_cases(store):
+            render_terminal(add_up(store), console)
         render_hard_cases(hard_table(store), console)
         written = write(store, out)
     click.echo(f"\nmeasured rows: {store.path}\nwritten to {out}:")
@@ -795,7 +796,15 @@ def _tables_only(store: Store, folder: Path) -> list[Path]:
     from reports.hard_cases import write_hard_cases
     from reports.tables import write_tables
 
-    return [*write_tables(store, folder), *write_hard_cases(store, folder)]
+    tables = [] if _only_hard_cases(store) else write_tables(store, folder)
+    return [*tables, *write_hard_cases(store, folder)]
+
+
+def _only_hard_cases(store: Store) -> bool:
+    """Hard cases have a table of their own: nothing on the scorecard comes of them."""
+    from harness.measurement import Kind
+
+    return set(store.frame("tasks")["kind"]) == {Kind.HARD_CASE.value}
 
 
 def _tables_and_figures(store: Store, folder: Path) -> list[Path]:

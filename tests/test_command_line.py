@@ -239,6 +239,15 @@ def test_the_scorecard_is_printed_and_the_files_are_named(measured: Path) -> Non
         assert (measured / "results" / name).is_file()
 
 
+def test_hard_cases_alone_have_their_table_and_no_card(tmp_path: Path) -> None:
+    out = str(tmp_path / "hard")
+    done = call("scorecard", "--tier", "hard", "--solver", "qce", "--scenario", "ball-in-wedge", "--out", out)
+    assert done.exit_code == 0, done.output
+    assert "hard_cases.md" in done.output
+    assert "store is empty" not in done.output
+    assert not (tmp_path / "hard" / "scorecard.md").exists()
+
+
 def test_figures_are_drawn_from_the_store_alone(measured: Path) -> None:
     before = (measured / "results" / FILE_NAME).read_bytes()
     done = call("figures", "--out", str(measured / "results"))
