@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import types
 from collections.abc import Callable
 from typing import ParamSpec, TypeVar, cast
 
@@ -37,3 +38,12 @@ def parallel_kernel(function: Callable[Parameters, Result]) -> Callable[Paramete
     """
     compiled = numba.njit(cache=True, error_model="numpy", fastmath=False, parallel=True)(function)
     return cast("Callable[Parameters, Result]", compiled)
+
+
+def alone(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
+    """Compile a `parallel_kernel` once more, for one thread: on a small problem threads wait more than they work."""
+    plain = getattr(function, "py_func", function)
+    # Under a name of its own: numba would keep both in the same files of its cache.
+    copy = types.FunctionType(plain.__code__, plain.__globals__, f"{plain.__name__}_alone")
+    copy.__module__ = plain.__module__
+    return kernel(copy)

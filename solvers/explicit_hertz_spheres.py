@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from solvers._jit import kernel, parallel_kernel, prange
+from solvers._jit import alone, kernel, parallel_kernel, prange
 from solvers.problem import ImpactProblem
 from solvers.solution import Floats
 from solvers.sphere_rows import Indices, SphereRows, sphere_rows
@@ -20,9 +20,14 @@ from solvers.sphere_rows import Indices, SphereRows, sphere_rows
 # Unsigned as the indices of `sphere_rows`: no test for negative ones.
 Offsets = npt.NDArray[np.uint64]
 
-# From this many contacts on, packing spheres and starting threads costs less than it saves: a third of the time of the
-# general rows on a pack of 364 contacts, a quarter on 3,030 (two cores).
+# From this many contacts on, packing spheres costs less than it saves: a third of the time of the general rows on a
+# pack of 364 contacts, a quarter on 3,030.
 PACKED_CONTACTS = 300
+# Contacts a body from which on they are a layer. In a chain few contacts press at a time, and a packed step looks at
+# all: the general rows take a quarter of the time there.
+LAYERED = 2
+# From this many contacts on sharing the work out pays: below it threads wait for one another most of the time.
+SHARED_CONTACTS = 30_000
 # Packed spheres share one step: the longest may be this many times the shortest.
 PACKED_SPREAD = 4.0
 # Chunks of contacts that threads share out; the same for any number of threads.
@@ -74,7 +79,8 @@ class Spheres:
         """
         v = v.copy()
         P = np.zeros(self.rate.size)
-        steps, visits, finished = _round(
+        run = _round if P.size >= SHARED_CONTACTS else _round_alone
+        steps, visits, finished = run(
             self.chunk, self.bodies_of_chunk, self.rows.normal, self.rows.body, self.stiffness,
             self.stiffness / self.rate, exponent, h, gap_memory, threshold, slowest, max_steps, max_visits, v, P,
         )  # fmt: skip
@@ -84,7 +90,7 @@ class Spheres:
 def spheres(problem: ImpactProblem, stiffness: Floats, *, exponent: float, V: float, w: float) -> Spheres | None:
     """Pack an elastic problem in units of velocity V and inverse mass w; None where it has another form."""
     rows = sphere_rows(problem) if problem.m >= PACKED_CONTACTS else None
-    if rows is None:
+    if rows is None or problem.m < LAYERED * (rows.V.shape[0] - 1):
         return None
     rows.V[:, :3] /= V
     rows.V[:, 3] /= w
@@ -317,3 +323,6 @@ def _round(
             for c in range(chunks):
                 awake[c] = pushes[c] or pushes[c + 1] or pushes[c + 2]
     return steps, visits, False
+
+
+_round_alone = alone(_round)

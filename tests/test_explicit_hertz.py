@@ -11,7 +11,7 @@ from hypothesis import given, settings
 
 from scenarios.jammed import ball_ring
 from scenarios.packs import sphere_pack
-from solvers import ImpactProblem, Status
+from solvers import ImpactProblem, Status, explicit_hertz_spheres
 from solvers.explicit_hertz import ExplicitHertz
 from solvers.explicit_hertz_rows import rows
 from solvers.hertz import Hertz
@@ -325,3 +325,12 @@ def test_the_number_of_threads_changes_no_bit() -> None:
 def test_settings_that_make_no_sense_are_refused(setting: dict[str, float]) -> None:
     with pytest.raises(ValueError, match=next(iter(setting))):
         ExplicitHertz(**setting)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("start", ["kick", "hot"])
+def test_one_thread_alone_gives_the_bits_of_all_threads(start: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    problem = sphere_pack(spheres=300, start=start).problem
+    assert explicit_hertz_spheres.PACKED_CONTACTS < problem.m < explicit_hertz_spheres.SHARED_CONTACTS
+    one = ExplicitHertz().solve(problem)
+    monkeypatch.setattr(explicit_hertz_spheres, "SHARED_CONTACTS", 0)
+    assert (ExplicitHertz().solve(problem).impulse == one.impulse).all()  # type: ignore[union-attr]
