@@ -43,7 +43,8 @@ def parallel_kernel(function: Callable[Parameters, Result]) -> Callable[Paramete
 def alone(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
     """Compile a `parallel_kernel` once more, for one thread: on a small problem threads wait more than they work."""
     plain = getattr(function, "py_func", function)
-    # Under a name of its own: numba would keep both in the same files of its cache.
+    # Under a name of its own, and a qualified name, by which numba finds a kernel's files in its cache: otherwise the
+    # one of the two that is compiled first would stand for both.
     copy = types.FunctionType(plain.__code__, plain.__globals__, f"{plain.__name__}_alone")
-    copy.__module__ = plain.__module__
+    copy.__module__, copy.__qualname__ = plain.__module__, copy.__name__
     return kernel(copy)

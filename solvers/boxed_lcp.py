@@ -22,7 +22,7 @@ from solvers import cone_projection, projected_gauss_seidel
 from solvers.problem import ImpactProblem, ProblemError
 from solvers.solution import Floats
 
-# Less than a minute or about one: a row visit takes 17-20 ns packed and 54-63 ns in CSR at 182,757 contacts.
+# About 20 s where a row visit takes 20 ns (`tests/benchmarks/test_bench_solvers.py` prints it), a minute or so in CSR.
 MAX_VISITS = 1_000_000_000
 
 

@@ -16,15 +16,17 @@ Small problems: DOP853 (Hairer, Nørsett and Wanner 1993), with an independent v
 variable also lands a step exactly on its event (Hénon 1982). On cradles of 3 to 10 balls the default tolerance gives
 velocities to 4e-11 and energy to 1e-10. Large problems: leapfrog with a fixed step, matrix-free; 50 steps a contact
 leave an energy error of 1e-6 on a pack of 1,000 spheres, and halving the step moves single velocities by 0.02 to 0.05.
-Where all restitutions are 1 that energy is put right: impulses αλ with α = -2 λ·u⁻/(λᵀWλ) conserve it, one number
-next to 1 that keeps signs, momenta and symmetries; what approaches then by |α - 1| of its speed is integrated again.
-|α - 1| is the part of leapfrog's error that shows in the energy, and is reported as the residual.
+Where all restitutions are 1 the energy of either is put right: impulses αλ with α = -2 λ·u⁻/(λᵀWλ) conserve it, one
+number next to 1 that keeps signs, momenta and symmetries; what approaches then by |α - 1| of its speed is integrated
+again. |α - 1| is the part of the method's error that shows in the energy, and is reported as the residual.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -61,6 +63,11 @@ CLOSING = 2
 """The gap of one contact, down to 0."""
 TURNING = 3
 """|u| of one contact, down to 0: from compression to expansion, or back."""
+
+# (problem, deepest gap, velocity, its largest approach, bound on visits, settings) to what `_adaptively` returns.
+Method: TypeAlias = Callable[
+    ["ImpactProblem", float, Floats, float, int, "Compliance"], tuple[Floats, Floats, int, int, bool]
+]
 
 _A = np.ascontiguousarray(DOP853.A, dtype=np.float64)
 _B = np.ascontiguousarray(DOP853.B, dtype=np.float64)
@@ -105,9 +112,9 @@ def integrate_with_gaps(problem: ImpactProblem, settings: Compliance) -> ImpactS
         settings: exponent and accuracy.
 
     Returns:
-        The solution; `iterations` are steps, `visits` contact evaluations, `residual` the energy defect
-        |½ λ·(u_pre + u_post) + Σ (1 - e²) C| / Σ C of the integration, where C is the work of compression of a
-        contact; where leapfrog is corrected, the largest |α - 1|.
+        The solution; `iterations` are steps, `visits` contact evaluations, `residual` the largest |α - 1|
+        where all restitutions are 1, else the energy defect |½ λ·(u_pre + u_post) + Σ (1 - e²) C| / Σ C of the
+        integration, where C is the work of compression of a contact.
     """
     return _integrate(problem, -math.inf, settings)
 
@@ -135,14 +142,10 @@ def _integrate(problem: ImpactProblem, deepest_gap: float, settings: Compliance)
     if V <= 0.0:
         return ImpactSolution(np.zeros(problem.m), problem.v_pre.copy(), Status.CONVERGED, 0, 0, 0.0)
     max_visits = settings.max_visits + VISITS_PER_CONTACT * problem.m
-    if problem.m <= settings.adaptive_contacts:
-        impulse, compressed, steps, visits, finished = _adaptively(problem, deepest_gap, V, max_visits, settings)
-    elif (problem.restitution == 1.0).all():
-        return _elastic_rounds(problem, deepest_gap, V, max_visits, settings)
-    else:
-        impulse, compressed, steps, visits, finished = _by_leapfrog(
-            problem, deepest_gap, problem.v_pre, V, max_visits, settings
-        )
+    method = _adaptively if problem.m <= settings.adaptive_contacts else _by_leapfrog
+    if (problem.restitution == 1.0).all():
+        return _elastic_rounds(problem, method, deepest_gap, V, max_visits, settings)
+    impulse, compressed, steps, visits, finished = method(problem, deepest_gap, problem.v_pre, V, max_visits, settings)
     v = problem.v_after(impulse)
     work = 0.5 * float(impulse @ (problem.u_pre + problem.J @ v))
     lost = float(((1.0 - problem.restitution**2) * compressed).sum())
@@ -151,14 +154,14 @@ def _integrate(problem: ImpactProblem, deepest_gap: float, settings: Compliance)
 
 
 def _elastic_rounds(
-    problem: ImpactProblem, deepest_gap: float, V: float, max_visits: int, settings: Compliance
+    problem: ImpactProblem, method: Method, deepest_gap: float, V: float, max_visits: int, settings: Compliance
 ) -> ImpactSolution:
-    """Leapfrog with its energy put right: α P, α = -2 P·u⁻/(PᵀWP), and again for what that leaves approaching."""
+    """A method with its energy put right: α P, α = -2 P·u⁻/(PᵀWP), and again for what that leaves approaching."""
     impulse = np.zeros(problem.m)
     v, u = problem.v_pre, problem.u_pre
     steps, visits, finished, correction = 0, 0, True, 0.0
     while finished and APPROACH * problem.speed < V:
-        P, _, taken, seen, finished = _by_leapfrog(problem, deepest_gap, v, V, max_visits - visits, settings)
+        P, _, taken, seen, finished = method(problem, deepest_gap, v, V, max_visits - visits, settings)
         steps += taken
         visits += seen
         rise = float(P @ (problem.J @ (problem.MJT @ P)))
@@ -172,13 +175,16 @@ def _elastic_rounds(
 
 
 def _adaptively(
-    problem: ImpactProblem, deepest_gap: float, V: float, max_visits: int, settings: Compliance
+    problem: ImpactProblem, deepest_gap: float, v: Floats, V: float, max_visits: int, settings: Compliance
 ) -> tuple[Floats, Floats, int, int, bool]:
-    """Impulse and work of compression of the adaptive method, steps, contact evaluations, finished."""
+    """Impulse and work of compression of the adaptive method, steps, contact evaluations, finished.
+
+    From a velocity v with the largest approach V.
+    """
     W = problem.W
     w, stiffness, recovery, deepest, duration = _units(problem, settings.exponent)
     impulse, compressed, steps, visits, finished = _adaptive(
-        W.indptr, W.indices, W.data / w, problem.u_pre / V, problem.W_diagonal / w,
+        W.indptr, W.indices, W.data / w, problem.J @ v / V, problem.W_diagonal / w,
         stiffness, recovery, deepest, settings.exponent, deepest_gap,
         settings.tolerance, 0.5 * APPROACH * problem.speed / V, 0.05 * duration, max_visits, _A, _B, _C, _E3, _E5,
     )  # fmt: skip
@@ -188,7 +194,7 @@ def _adaptively(
 def _by_leapfrog(
     problem: ImpactProblem, deepest_gap: float, v: Floats, V: float, max_visits: int, settings: Compliance
 ) -> tuple[Floats, Floats, int, int, bool]:
-    """As `_adaptively`, by leapfrog, from a velocity v with the largest approach V."""
+    """As `_adaptively`, by leapfrog."""
     J, JM, JT = problem.J, problem.JM, problem.JT
     w, stiffness, recovery, deepest, duration = _units(problem, settings.exponent)
     # Contacts that press together on a body are as stiff as the sum of them: on a box with 1,000 points a contact

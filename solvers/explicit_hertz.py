@@ -63,9 +63,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
+from solvers._jit import kernel
 from solvers.boxed_lcp import MAX_VISITS
 from solvers.compression import pair_duration
 from solvers.explicit_hertz_rows import Rows, rows
@@ -122,27 +124,29 @@ class ExplicitHertz:
         """Solve one multi-impact of any restitution and friction."""
         V = -float(problem.u_pre.min(initial=0.0))
         if self.tolerance * problem.speed >= V:
-            return _solution(problem, self.tolerance, np.zeros(problem.m), None, 0, problem.m, True)
+            run = _Run(problem.v_pre, -V, np.zeros(problem.m), np.zeros(0), 0, problem.m, True)
+            return _solution(problem, self.tolerance, problem.v_pre.copy(), run.u_min, run.P, None, run)
         # Out with the units: speeds by the fastest approach, W by its largest diagonal entry, k by its mean.
         w = float(problem.W_diagonal.max())
         stiffness = problem.stiffness / math.exp(float(np.log(problem.stiffness).mean()))
         threshold = MARGIN * self.tolerance * problem.speed / V
         elastic = bool(problem.restitution.min() == 1.0)
-        packed = None
         if elastic and not problem.has_friction:
             packed = spheres(problem, stiffness, exponent=self.exponent, V=V, w=w)
-        if packed is not None:
-            P, P_t, steps, visits, finished = self._bounce(packed, threshold)
-            P = packed.rows.in_problem_order(P)
-        elif elastic:
-            P, P_t, steps, visits, finished = self._bounce(rows(problem, stiffness, V=V, w=w), threshold)
-        else:
-            P, P_t, steps, visits, finished = self._bounce_and_settle(rows(problem, stiffness, V=V, w=w), threshold)
-        friction_impulse = P_t * (V / w) if problem.has_friction else None
-        return _solution(problem, self.tolerance, P * (V / w), friction_impulse, steps, visits, finished)
+            if packed is not None:
+                run = self._bounce(packed, threshold)
+                v, impulse = packed.in_problem_order(run.v, run.P)
+                return _solution(problem, self.tolerance, V * v, V * run.u_min, impulse * (V / w), None, run)
+        contacts = rows(problem, stiffness, V=V, w=w)
+        run = self._bounce(contacts, threshold) if elastic else self._bounce_and_settle(contacts, threshold)
+        impulse = run.P * (V / w)
+        friction_impulse = run.P_t * (V / w) if problem.has_friction else None
+        # Anew from the impulses: large mass ratios cancel most of them, and the sum of many small pushes differs.
+        v = problem.v_after(impulse, friction_impulse)
+        return _solution(problem, self.tolerance, v, float((problem.J @ v).min()), impulse, friction_impulse, run)
 
-    def _bounce(self, contacts: Rows | Spheres, threshold: float) -> tuple[Floats, Floats, int, int, bool]:
-        """Elastic rounds until nothing approaches; returns impulse, friction impulse, steps, visits, finished."""
+    def _bounce(self, contacts: Rows | Spheres, threshold: float) -> _Run:
+        """Elastic rounds until nothing approaches."""
         impulse = np.zeros(contacts.rate.size)
         friction_impulse = np.zeros(contacts.slip(contacts.v_pre).size)
         v = contacts.v_pre
@@ -178,10 +182,10 @@ class ExplicitHertz:
                 v = v + scale * (v_end - v)
                 u = u + scale * (u_end - u)
             gap_memory = 1.0
-        return impulse, friction_impulse, steps, visits, finished
+        return _Run(v, float(u.min()), impulse, friction_impulse, steps, visits, finished)
 
-    def _bounce_and_settle(self, contacts: Rows, threshold: float) -> tuple[Floats, Floats, int, int, bool]:
-        """One round with restitution below 1, then rest; returns what `_bounce` does."""
+    def _bounce_and_settle(self, contacts: Rows, threshold: float) -> _Run:
+        """One round with restitution below 1, then rest."""
         v = contacts.v_pre
         gap_memory = max(self.gap_memory, SETTLING) if self.gap_memory > 0.0 else 0.0
         # Once gaps are forgotten no contact starts any more: what presses ends as its restitution says.
@@ -195,9 +199,10 @@ class ExplicitHertz:
         scale = min(-2.0 * a / b, 1.0) if b > 0.0 else 1.0
         v = v + scale * (v_end - v)
         most = min(MOST_SWEEPS, self.max_steps - steps, max(self.max_visits - visits, 0) // u.size)
-        _, rest, sweeps, settled = contacts.settle(v, threshold=threshold, max_steps=most)
+        v, rest, sweeps, settled = contacts.settle(v, threshold=threshold, max_steps=most)
         visits += sweeps * rest.size
-        return scale * P + rest, scale * P_t, steps + sweeps, visits, finished and settled
+        u_min = float(contacts.relative_velocity(v).min())
+        return _Run(v, u_min, scale * P + rest, scale * P_t, steps + sweeps, visits, finished and settled)
 
     def _step(self, contacts: Rows | Spheres, V: float) -> float:
         """Shortest step of a round whose fastest approach is V."""
@@ -206,28 +211,48 @@ class ExplicitHertz:
         return float(pair * contacts.rate.max() ** -a * V ** (1.0 - 2.0 * self.exponent * a))
 
 
+class _Run(NamedTuple):
+    """What rounds come to, in their own units and order."""
+
+    v: Floats
+    u_min: float
+    P: Floats
+    P_t: Floats
+    steps: int
+    visits: int
+    finished: bool
+
+
+@kernel
 def _powers(P: Floats, u: Floats, u_end: Floats, P_t: Floats, slip: Floats, slip_end: Floats) -> tuple[float, float]:
-    """First and second order of the energy of impulses αP, αP_t that take u to u_end at α = 1: α a + ½ α² b."""
-    # Thousands of steps between two walls can leave the range of numbers: such a run is thrown away.
-    with np.errstate(over="ignore", invalid="ignore"):
-        return float(P @ u + P_t @ slip), float(P @ (u_end - u) + P_t @ (slip_end - slip))
+    """First and second order of the energy of impulses αP, αP_t that take u to u_end at α = 1: α a + ½ α² b.
+
+    On one thread: a library that shares out a sum of products sums differently on another machine.
+    """
+    a = 0.0
+    b = 0.0
+    for i in range(P.size):
+        a += P[i] * u[i]
+        b += P[i] * (u_end[i] - u[i])
+    for i in range(P_t.size):
+        a += P_t[i] * slip[i]
+        b += P_t[i] * (slip_end[i] - slip[i])
+    return a, b
 
 
 def _solution(
-    problem: ImpactProblem, tolerance: float, impulse: Floats, friction_impulse: Floats | None,
-    steps: int, visits: int, finished: bool,
+    problem: ImpactProblem, tolerance: float, v: Floats, u_min: float, impulse: Floats, friction_impulse: Floats | None,
+    run: _Run,
 ) -> ImpactSolution:  # fmt: skip
-    """Judge a run by the velocity that its impulse gives."""
-    v = problem.v_after(impulse, friction_impulse)
-    u_min = float((problem.J @ v).min(initial=0.0))
+    """Judge a run by its velocity v, and the least relative velocity u_min there."""
     if not np.isfinite(v).all():
         status = Status.NOT_FINITE
-    elif not finished:
+    elif not run.finished:
         status = Status.ITERATION_LIMIT
     elif u_min < -tolerance * problem.speed:
         # The kernel's velocity passed the test; impulses that cancel (large mass ratios) leave their rounding here.
         status = Status.STALLED
     else:
         status = Status.CONVERGED
-    residual = -u_min / (problem.speed or 1.0)
-    return ImpactSolution(impulse, v, status, steps, visits, residual, friction_impulse)
+    residual = max(-u_min, 0.0) / (problem.speed or 1.0)
+    return ImpactSolution(impulse, v, status, run.steps, run.visits, residual, friction_impulse)

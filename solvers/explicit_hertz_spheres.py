@@ -1,13 +1,20 @@
 """Rounds of explicit Hertz impulses on packed spheres: elastic, without friction, one step for all, any threads.
 
-The law and its step are those of `solvers.explicit_hertz`. A step sweeps over all contacts once, listing those that
-press, and over the list twice (force, Rowlands' shift). Contacts are cut into chunks such that those of one parity
-share no body: the chunks of a parity run at the same time, and what a body sums up has one order whoever does it.
+The law and its step are those of `solvers.explicit_hertz`. While gaps are remembered, or much presses, a step sweeps
+over all contacts, lists those that press, and goes over the list once more for Rowlands' shift. Contacts are cut into
+chunks such that those of one parity share no body: the chunks of a parity run at the same time, and what a body sums
+up has one order whoever does it. Once gaps are forgotten and little presses, only contacts of bodies that were pushed
+are looked at, on one thread.
+
+Stiffness is taken out: with rows k^(1/(η+1)) n in place of n, compressions and impulses by contact are those of k = 1,
+and the velocities of the bodies stay as they are.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -32,19 +39,36 @@ SHARED_CONTACTS = 30_000
 PACKED_SPREAD = 4.0
 # Chunks of contacts that threads share out; the same for any number of threads.
 MOST_CHUNKS = 64
+# A pressing contact pushes two bodies, which take part in five others each: with fewer pressing than one in so many,
+# contacts of pushed bodies are fewer than half of all.
+SPARSE = 24
+# Numba makes a signed index of an unsigned one and a plain number, and tests it for being negative at every access.
+ONE, TWO, THREE = np.uint64(1), np.uint64(2), np.uint64(3)
 # A gap that closes after a wait is zero to the rounding of that wait.
 CLOSED = 1e-14
 
 
 @dataclass(frozen=True)
 class Spheres:
-    """Elastic contacts of spheres without spin, in units of the problem's own."""
+    """Elastic contacts of spheres without spin, in units of the problem's own; kernels see flat, read-only arrays."""
 
     rows: SphereRows
-    """Normals, bodies and velocities; every chunk of contacts has an immovable body of its own, at the end."""
+    """The problem packed; its normals and bodies are not those of the kernels."""
 
-    stiffness: Floats
-    """Relative stiffness, shape (m,)."""
+    n: int
+    """Velocities of the problem."""
+
+    v_pre: Floats
+    """Velocity of the bodies, then their inverse mass; one immovable body a chunk at the end; (bodies + chunks, 4)."""
+
+    normal: Floats
+    """k^(1/(η+1)) n, shape (3m,)."""
+
+    body: Indices
+    """Where the rows of bodies a and b begin in flat velocities, shape (2m,)."""
+
+    scale: Floats
+    """k^(1/(η+1)), shape (m,)."""
 
     rate: Floats
     """(W K W)_ii / W_ii, shape (m,)."""
@@ -55,18 +79,23 @@ class Spheres:
     bodies_of_chunk: int
     """Bodies whose contacts a chunk takes."""
 
-    @property
-    def v_pre(self) -> Floats:
-        """Velocity of the bodies [m/s], and in the last column their inverse mass; shape (bodies + chunks, 4)."""
-        return self.rows.V
-
     def relative_velocity(self, v: Floats) -> Floats:
         """Normal relative velocities at a velocity of the bodies, shape (m,)."""
-        return _relative_velocity(self.rows.normal, self.rows.body, v)
+        return _relative_velocity(self.normal, self.body, v.reshape(-1)) / self.scale
 
     def slip(self, v: Floats) -> Floats:
         """Nothing slips: there is no friction."""
         return np.zeros(0)
+
+    def in_problem_order(self, v: Floats, P: Floats) -> tuple[Floats, Floats]:
+        """Velocity, shape (n,), and impulse, shape (m,), as the problem orders them."""
+        velocity = self.rows.velocity_in_problem_order(v[: self.rows.V.shape[0]], self.n)
+        return velocity, self.rows.in_problem_order(P)
+
+    @cached_property
+    def contacts_of_body(self) -> tuple[Indices, Indices]:
+        """Where the contacts of each movable body begin, shape (bodies + 1,), and these contacts."""
+        return _contacts_of_body(self.body, self.v_pre.shape[0] - self.chunk.size + 1)
 
     def integrate(
         self, v: Floats, *, exponent: float, h: float, gap_memory: float, threshold: float, slowest: float,
@@ -78,13 +107,24 @@ class Spheres:
             Velocity, impulse, friction impulse (none), energy that friction took (0), steps, contact visits, finished.
         """
         v = v.copy()
+        V = v.reshape(-1)
         P = np.zeros(self.rate.size)
-        run = _round if P.size >= SHARED_CONTACTS else _round_alone
-        steps, visits, finished = run(
-            self.chunk, self.bodies_of_chunk, self.rows.normal, self.rows.body, self.stiffness,
-            self.stiffness / self.rate, exponent, h, gap_memory, threshold, slowest, max_steps, max_visits, v, P,
-        )  # fmt: skip
-        return v, P, np.zeros(0), 0.0, steps, visits, finished
+        compression = np.zeros(self.rate.size)
+        steps, visits, finished = 0, 0, False
+        if gap_memory < 1.0:
+            sweep = _sweep if P.size >= SHARED_CONTACTS else _sweep_alone
+            steps, visits, finished = sweep(
+                self.chunk, self.bodies_of_chunk, self.normal, self.body, 1.0 / self.rate.mean(), exponent, h,
+                gap_memory, threshold, slowest, max_steps, max_visits, V, P, compression,
+            )  # fmt: skip
+        if not finished:
+            more, seen, finished = _follow(
+                *self.contacts_of_body, self.normal, self.body, exponent, h, slowest, max_steps - steps,
+                max_visits - visits, V, P, compression,
+            )  # fmt: skip
+            steps += more
+            visits += seen
+        return v, P * self.scale, np.zeros(0), 0.0, steps, visits, finished
 
 
 def spheres(problem: ImpactProblem, stiffness: Floats, *, exponent: float, V: float, w: float) -> Spheres | None:
@@ -92,20 +132,33 @@ def spheres(problem: ImpactProblem, stiffness: Floats, *, exponent: float, V: fl
     rows = sphere_rows(problem) if problem.m >= PACKED_CONTACTS else None
     if rows is None or problem.m < LAYERED * (rows.V.shape[0] - 1):
         return None
-    rows.V[:, :3] /= V
-    rows.V[:, 3] /= w
-    stiffness = stiffness[rows.contact]
-    rate = _rates(rows.normal, rows.body, rows.V, stiffness)
-    if (rate.max() / rate.min()) ** (1.0 / (exponent + 1.0)) > PACKED_SPREAD:
-        return None
     bodies = rows.V.shape[0] - 1
     chunk, bodies_of_chunk = _chunks(rows.body, bodies)
+    v_pre = np.zeros((bodies + chunk.size - 1, 4))
+    v_pre[:bodies, :3] = rows.V[:-1, :3] / V
+    v_pre[:bodies, 3] = rows.V[:-1, 3] / w
+    # All are 1 where all are alike; a power costs as much as a sweep.
+    alike = bool((stiffness == 1.0).all())
+    stiffness = stiffness if alike else stiffness[rows.contact]
+    scale = stiffness if alike else stiffness ** (1.0 / (exponent + 1.0))
+    rate = _rates(rows.normal, rows.body, v_pre, stiffness)
+    if (rate.max() / rate.min()) ** (1.0 / (exponent + 1.0)) > PACKED_SPREAD:
+        return None
     # Threads must not push the floor together: it gets a number for each chunk.
     number = np.repeat(np.arange(bodies, bodies + chunk.size - 1, dtype=np.uint32), np.diff(chunk).astype(np.int64))
-    body = np.where(rows.body == bodies, number[:, None], rows.body)
-    floors = np.zeros((chunk.size - 2, 4))
-    rows = SphereRows(rows.normal, body, np.vstack([rows.V, floors]), rows.contact)
-    return Spheres(rows, stiffness, rate, chunk, bodies_of_chunk)
+    body = np.uint32(4) * np.where(rows.body == bodies, number[:, None], rows.body)
+    normal = rows.normal.view() if alike else rows.normal * scale[:, None]
+    return Spheres(rows, problem.n, v_pre, _read_only(normal), _read_only(body), scale, rate, chunk, bodies_of_chunk)
+
+
+Entry = TypeVar("Entry", np.float64, np.uint32)
+
+
+def _read_only(array: npt.NDArray[Entry]) -> npt.NDArray[Entry]:
+    """Flatten an array of this file and freeze it: a kernel is compiled for one kind of array."""
+    flat = array.reshape(-1)
+    flat.flags.writeable = False
+    return flat
 
 
 def _chunks(body: Indices, bodies: int) -> tuple[Offsets, int]:
@@ -121,14 +174,33 @@ def _chunks(body: Indices, bodies: int) -> tuple[Offsets, int]:
 
 
 @kernel
+def _contacts_of_body(body: Indices, bodies: int) -> tuple[Indices, Indices]:
+    """Where the contacts of each body begin, shape (bodies + 1,), and these contacts; others have none."""
+    first = np.zeros(bodies + 2, np.uint32)
+    for b in body:
+        if b < 4 * bodies:
+            first[(b >> 2) + 2] += 1
+    for k in range(bodies):
+        first[k + 2] += first[k + 1]
+    contact = np.empty(first[bodies + 1], np.uint32)
+    for q in range(body.size):
+        k = body[q] >> 2
+        if k < bodies:
+            contact[first[k + 1]] = q >> 1
+            first[k + 1] += 1
+    return first[:-1], contact
+
+
+@kernel
 def _relative_velocity(normal: Floats, body: Indices, V: Floats) -> Floats:
-    """Normal relative velocities n · (v_b - v_a), shape (m,)."""
-    u = np.empty(body.shape[0])
+    """Relative velocities n · (v_b - v_a) along the rows, shape (m,)."""
+    u = np.empty(body.size // 2)
     for i in range(u.size):
-        a, b = body[i, 0], body[i, 1]
+        a, b = body[TWO * i], body[TWO * i + ONE]
         u[i] = (
-            normal[i, 0] * (V[b, 0] - V[a, 0]) + normal[i, 1] * (V[b, 1] - V[a, 1]) + normal[i, 2] * (V[b, 2] - V[a, 2])
-        )
+            normal[THREE * i] * (V[b] - V[a]) + normal[THREE * i + ONE] * (V[b + ONE] - V[a + ONE])
+            + normal[THREE * i + TWO] * (V[b + TWO] - V[a + TWO])
+        )  # fmt: skip
     return u
 
 
@@ -163,75 +235,99 @@ def _rates(normal: Floats, body: Indices, V: Floats, stiffness: Floats) -> Float
 
 
 @kernel
-def _force(stiffness: float, compression: float, exponent: float) -> float:
-    """Contact force k δ^η of a δ ≥ 0; the two usual exponents go without the general power."""
+def _force(compression: float, exponent: float) -> float:
+    """Contact force δ^η of a δ ≥ 0; the two usual exponents go without the general power."""
     if exponent == 1.5:
-        return float(stiffness * compression * np.sqrt(compression))
+        return float(compression * np.sqrt(compression))
     if exponent == 1.0:
-        return stiffness * compression
-    return float(stiffness * compression**exponent)
+        return compression
+    return float(compression**exponent)
 
 
 @kernel
-def _scatter(body: Indices, normal: Floats, i: int, kick: float, push: Floats) -> None:
-    """Add an impulse of contact i to what its two bodies are pushed with."""
-    a, b = body[i, 0], body[i, 1]
-    push[b, 0] += kick * normal[i, 0]
-    push[b, 1] += kick * normal[i, 1]
-    push[b, 2] += kick * normal[i, 2]
-    push[a, 0] -= kick * normal[i, 0]
-    push[a, 1] -= kick * normal[i, 1]
-    push[a, 2] -= kick * normal[i, 2]
+def _push(normal: Floats, body: Indices, i: np.uint64, kick: float, V: Floats) -> None:
+    """Add what an impulse of contact i does to the velocities of its two bodies; their inverse masses stand in V."""
+    a, b = body[TWO * i], body[TWO * i + ONE]
+    n0, n1, n2 = normal[THREE * i], normal[THREE * i + ONE], normal[THREE * i + TWO]
+    for_a = kick * V[a + THREE]
+    for_b = kick * V[b + THREE]
+    V[b] += for_b * n0
+    V[b + ONE] += for_b * n1
+    V[b + TWO] += for_b * n2
+    V[a] -= for_a * n0
+    V[a + ONE] -= for_a * n1
+    V[a + TWO] -= for_a * n2
+
+
+@kernel
+def _shifted(
+    normal: Floats, body: Indices, i: np.uint64, compression: float, h: float, exponent: float, dv: Floats
+) -> float:
+    """Impulse of a step by Rowlands' shift, where all impulses of the unshifted force add dv."""
+    a, b = body[TWO * i], body[TWO * i + ONE]
+    w = (
+        normal[THREE * i] * (dv[b] - dv[a]) + normal[THREE * i + ONE] * (dv[b + ONE] - dv[a + ONE])
+        + normal[THREE * i + TWO] * (dv[b + TWO] - dv[a + TWO])
+    )  # fmt: skip
+    return h * _force(max(compression - h / 12.0 * w, 0.0), exponent)
 
 
 @kernel
 def _press(
-    begin: np.uint64, end: np.uint64, normal: Floats, body: Indices, stiffness: Floats, inertia: Floats,
+    begin: np.uint64, end: np.uint64, normal: Floats, body: Indices, inertia: float,
     exponent: float, h: float, remembers: bool, slowest: float, V: Floats, compression: Floats, pressing: Indices,
-    kick: Floats, push: Floats,
+    dv: Floats,
 ) -> tuple[float, np.uint64]:  # fmt: skip
-    """Drift, force and push of a chunk; lists who presses. Returns the energy left there and the end of the list."""
+    """Drift and unshifted push of a chunk; lists who presses. Returns the energy left there and the end of the list."""
     approach = 0.0
     count = np.uint64(begin)
     for i in range(begin, end):
-        a, b = body[i, 0], body[i, 1]
-        u = normal[i, 0] * (V[b, 0] - V[a, 0]) + normal[i, 1] * (V[b, 1] - V[a, 1]) + normal[i, 2] * (V[b, 2] - V[a, 2])
-        deep = compression[i] - h * u
-        if not remembers:
-            deep = max(max(compression[i], 0.0) - h * u, 0.0) if (compression[i] > 0.0) | (u < -slowest) else 0.0
+        a, b = body[TWO * i], body[TWO * i + ONE]
+        u = (
+            normal[THREE * i] * (V[b] - V[a]) + normal[THREE * i + ONE] * (V[b + ONE] - V[a + ONE])
+            + normal[THREE * i + TWO] * (V[b + TWO] - V[a + TWO])
+        )  # fmt: skip
+        deep = compression[i]
+        if remembers:
+            deep -= h * u
+        else:
+            # No branch: where gaps are forgotten, which contacts press is anybody's guess.
+            deep = max(max(deep, 0.0) - h * u, 0.0) * ((deep > 0.0) | (u < -slowest))
         compression[i] = deep
         closing = min(u, 0.0)
-        approach += closing * closing * inertia[i]
+        approach += closing * closing
         # No branch: which of them press is anybody's guess.
         pressing[count] = i
         count += np.uint64(deep > 0.0)
     stored = 0.0
     for c in range(begin, count):
-        i = pressing[c]
-        force = _force(stiffness[i], compression[i], exponent)
-        stored += force * compression[i]
-        kick[c] = h * force
-        _scatter(body, normal, i, kick[c], push)
-    return 0.5 * approach + stored / (exponent + 1.0), count
+        j = np.uint64(pressing[c])
+        force = _force(compression[j], exponent)
+        stored += force * compression[j]
+        _push(normal, body, j, h * force, dv)
+    return 0.5 * approach * inertia + stored / (exponent + 1.0), count
 
 
 @kernel
 def _shift(
-    begin: np.uint64, end: np.uint64, normal: Floats, body: Indices, stiffness: Floats, exponent: float, h: float,
-    V: Floats, compression: Floats, pressing: Indices, push: Floats, kick: Floats, P: Floats,
+    begin: np.uint64, end: np.uint64, normal: Floats, body: Indices, exponent: float, h: float,
+    compression: Floats, pressing: Indices, dv: Floats, V: Floats, P: Floats,
 ) -> None:  # fmt: skip
-    """Rowlands' shift of the listed contacts: what is still to be added to their kicks."""
+    """Shifted pushes of the listed contacts."""
     for c in range(begin, end):
-        i = pressing[c]
-        a, b = body[i, 0], body[i, 1]
-        w = (
-            normal[i, 0] * (V[b, 3] * push[b, 0] - V[a, 3] * push[a, 0])
-            + normal[i, 1] * (V[b, 3] * push[b, 1] - V[a, 3] * push[a, 1])
-            + normal[i, 2] * (V[b, 3] * push[b, 2] - V[a, 3] * push[a, 2])
-        )
-        shifted = h * _force(stiffness[i], max(compression[i] - h / 12.0 * w, 0.0), exponent)
-        P[i] += shifted
-        kick[c] = shifted - kick[c]
+        i = np.uint64(pressing[c])
+        kick = _shifted(normal, body, i, compression[i], h, exponent, dv)
+        P[i] += kick
+        _push(normal, body, i, kick, V)
+
+
+@kernel
+def _clear(begin: int, end: int, dv: Floats) -> None:
+    """Zero the velocities of bodies begin to end; their inverse masses stay."""
+    for k in range(np.uint64(4 * begin), np.uint64(min(4 * end, dv.size)), np.uint64(4)):
+        dv[k] = 0.0
+        dv[k + ONE] = 0.0
+        dv[k + TWO] = 0.0
 
 
 @kernel
@@ -252,26 +348,26 @@ def _close_next_gap(normal: Floats, body: Indices, V: Floats, threshold: float, 
 
 
 @parallel_kernel
-def _round(
-    chunk: Offsets, size: int, normal: Floats, body: Indices, stiffness: Floats, inertia: Floats,
+def _sweep(
+    chunk: Offsets, size: int, normal: Floats, body: Indices, inertia: float,
     exponent: float, h: float, gap_memory: float, threshold: float, slowest: float, max_steps: int, max_visits: int,
-    V: Floats, P: Floats,
+    V: Floats, P: Floats, compression: Floats,
 ) -> tuple[int, int, bool]:  # fmt: skip
-    """One round; changes V and P. Returns steps, contact visits, finished."""
-    m = body.shape[0]
+    """Steps over all contacts until gaps are forgotten and little presses; changes V, P and compression.
+
+    Returns:
+        Steps, contact visits, finished.
+    """
+    m = P.size
     chunks = chunk.size - 1
-    bodies = V.shape[0] - chunks
-    compression = np.zeros(m)
     pressing = np.zeros(m, np.uint32)
-    kick = np.zeros(m)
-    push = np.zeros((V.shape[0], 4))
+    # What the unshifted pushes of a step add to V.
+    dv = V.copy()
+    _clear(0, dv.size // 4, dv)
     # Where the lists of the chunks end.
     end = chunk.copy()
-    # One chunk more at either side, without contacts, saves questions.
-    pushes = np.zeros(chunks + 2, np.bool_)
-    awake = np.ones(chunks, np.bool_)
     left_in = np.zeros(chunks)
-    remembers = gap_memory < 1.0
+    remembers = True
     peak = 0.0
     steps = 0
     visits = 0
@@ -280,49 +376,106 @@ def _round(
         for parity in range(2):
             for half in prange((chunks + 1 - parity) // 2):
                 c = 2 * half + parity
-                if awake[c]:
-                    left_in[c], end[c] = _press(
-                        chunk[c], chunk[c + 1], normal, body, stiffness, inertia, exponent, h, remembers, slowest,
-                        V, compression, pressing, kick, push,
-                    )  # fmt: skip
-                    pushes[c + 1] = end[c] > chunk[c]
+                left_in[c], end[c] = _press(
+                    chunk[c], chunk[c + 1], normal, body, inertia, exponent, h, remembers, slowest,
+                    V, compression, pressing, dv,
+                )  # fmt: skip
         left = 0.0
         n_pressing = 0
         for c in range(chunks):
             left += left_in[c]
             n_pressing += int(end[c] - chunk[c])
-            if awake[c]:
-                visits += int(chunk[c + 1] - chunk[c])
-        visits += n_pressing
-        if n_pressing == 0:
-            if not (remembers and _close_next_gap(normal, body, V, threshold, compression)):
+        visits += m + n_pressing
+        if n_pressing == 0 and remembers:
+            if not _close_next_gap(normal, body, V, threshold, compression):
                 return steps, visits, True
             visits += m
             continue
-        for c in prange(chunks):
-            _shift(
-                chunk[c], end[c], normal, body, stiffness, exponent, h, V, compression, pressing, push, kick, P
-            )  # fmt: skip
         for parity in range(2):
             for half in prange((chunks + 1 - parity) // 2):
                 c = 2 * half + parity
-                for place in range(chunk[c], end[c]):
-                    _scatter(body, normal, pressing[place], kick[place], push)
-        for c in prange(chunks):
-            # The bodies of a chunk are pushed by its contacts and by those of the chunk before.
-            if pushes[c] or pushes[c + 1]:
-                for k in range(c * size, min((c + 1) * size, bodies)):
-                    for axis in range(3):
-                        V[k, axis] += V[k, 3] * push[k, axis]
-                        push[k, axis] = 0.0
-        if remembers:
-            peak = max(peak, left)
-            remembers = left >= gap_memory * gap_memory * peak
-        else:
-            # Without gaps, what nobody pushes stays as it is.
-            for c in range(chunks):
-                awake[c] = pushes[c] or pushes[c + 1] or pushes[c + 2]
+                _shift(chunk[c], end[c], normal, body, exponent, h, compression, pressing, dv, V, P)
+                # Chunks read the bodies of their own and of the next: the odd ones are the last to.
+                if parity == 1:
+                    _clear(c * size, (c + 2) * size, dv)
+                elif c == 0:
+                    _clear(0, size, dv)
+        peak = max(peak, left)
+        remembers = remembers and left >= gap_memory * gap_memory * peak
+        if not remembers and SPARSE * n_pressing < m:
+            break
     return steps, visits, False
 
 
-_round_alone = alone(_round)
+_sweep_alone = alone(_sweep)
+
+
+@kernel
+def _follow(
+    first: Indices, contact: Indices, normal: Floats, body: Indices,
+    exponent: float, h: float, slowest: float, max_steps: int, max_visits: int,
+    V: Floats, P: Floats, compression: Floats,
+) -> tuple[int, int, bool]:  # fmt: skip
+    """Steps without gaps over the contacts of pushed bodies, until none presses; changes V, P and compression.
+
+    Returns:
+        Steps, contact visits, finished.
+    """
+    m = P.size
+    dv = V.copy()
+    _clear(0, dv.size // 4, dv)
+    # Contacts to look at, those of them that press, and the bodies that these push.
+    watched = np.empty(m, np.uint32)
+    pressing = np.empty(m, np.uint32)
+    pushed = np.empty(first.size, np.uint32)
+    seen = np.zeros(m, np.int32)
+    moved = np.zeros(first.size, np.int32)
+    u = _relative_velocity(normal, body, V)
+    n_watched = 0
+    for i in range(m):
+        watched[n_watched] = i
+        n_watched += (compression[i] > 0.0) | (u[i] < -slowest)
+    visits = m
+    for step in range(1, max_steps + 1):
+        if visits >= max_visits:
+            return step - 1, visits, False
+        n_pressing = 0
+        n_pushed = 0
+        for c in range(n_watched):
+            j = np.uint64(watched[c])
+            a, b = body[TWO * j], body[TWO * j + ONE]
+            u_i = (
+                normal[THREE * j] * (V[b] - V[a]) + normal[THREE * j + ONE] * (V[b + ONE] - V[a + ONE])
+                + normal[THREE * j + TWO] * (V[b + TWO] - V[a + TWO])
+            )  # fmt: skip
+            starts = (compression[j] > 0.0) | (u_i < -slowest)
+            compression[j] = max(max(compression[j], 0.0) - h * u_i, 0.0) if starts else 0.0
+            if compression[j] > 0.0:
+                pressing[n_pressing] = j
+                n_pressing += 1
+                _push(normal, body, j, h * _force(compression[j], exponent), dv)
+                for side in range(2):
+                    k = body[TWO * j + np.uint64(side)] >> 2
+                    if k + 1 < first.size and moved[k] != step:
+                        moved[k] = step
+                        pushed[n_pushed] = k
+                        n_pushed += 1
+        visits += n_watched + n_pressing
+        if n_pressing == 0:
+            return step, visits, True
+        for c in range(n_pressing):
+            j = np.uint64(pressing[c])
+            kick = _shifted(normal, body, j, compression[j], h, exponent, dv)
+            P[j] += kick
+            _push(normal, body, j, kick, V)
+        n_watched = 0
+        for c in range(n_pushed):
+            k = pushed[c]
+            _clear(k, k + 1, dv)
+            for q in range(first[k], first[k + 1]):
+                i = contact[q]
+                if seen[i] != step:
+                    seen[i] = step
+                    watched[n_watched] = i
+                    n_watched += 1
+    return max_steps, visits, False

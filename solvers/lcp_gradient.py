@@ -41,8 +41,8 @@ ROUNDING = 1e-12
 
 
 @dataclass(frozen=True)
-class AcceleratedProjectedGradient:
-    """Newton LCP by Nesterov's accelerated projected gradient, restarted where it climbs; no friction."""
+class ProjectedGradient:
+    """Settings of both methods."""
 
     tolerance: float = 1e-11
     """Natural-map residual at which to stop, relative to the largest |u_pre|."""
@@ -52,35 +52,11 @@ class AcceleratedProjectedGradient:
 
     max_visits: int = MAX_VISITS
     """Bound on contact visits; one step may exceed it by two products."""
-
-    def solve(self, problem: ImpactProblem, *, start: Floats | None = None) -> ImpactSolution:
-        """Solve one multi-impact with any restitution per contact, without friction.
-
-        Args:
-            problem: the impact.
-            start: first guess of the normal impulse [N s], shape (m,); a pull counts as 0.
-
-        Raises:
-            UnsupportedProblem: friction.
-            ProblemError: the guess has another shape or is not finite.
-        """
-        return _solution(
-            problem, _accelerated, first_guess(problem, start), self.tolerance, self.max_iterations, self.max_visits
-        )
 
 
 @dataclass(frozen=True)
-class SpectralProjectedGradient:
-    """Newton LCP by the spectral projected gradient with a nonmonotone line search; no friction."""
-
-    tolerance: float = 1e-11
-    """Natural-map residual at which to stop, relative to the largest |u_pre|."""
-
-    max_iterations: int = 20_000
-    """Bound on steps, each one product with W."""
-
-    max_visits: int = MAX_VISITS
-    """Bound on contact visits; one step may exceed it by two products."""
+class AcceleratedProjectedGradient(ProjectedGradient):
+    """Newton LCP by Nesterov's accelerated projected gradient, restarted where it climbs; no friction."""
 
     def solve(self, problem: ImpactProblem, *, start: Floats | None = None) -> ImpactSolution:
         """Solve one multi-impact with any restitution per contact, without friction.
@@ -93,14 +69,28 @@ class SpectralProjectedGradient:
             UnsupportedProblem: friction.
             ProblemError: the guess has another shape or is not finite.
         """
-        return _solution(
-            problem, _spectral, first_guess(problem, start), self.tolerance, self.max_iterations, self.max_visits
-        )
+        return _solution(problem, _accelerated, first_guess(problem, start), self)
 
 
-def _solution(
-    problem: ImpactProblem, method: object, guess: Floats, tolerance: float, max_iterations: int, max_visits: int
-) -> ImpactSolution:
+@dataclass(frozen=True)
+class SpectralProjectedGradient(ProjectedGradient):
+    """Newton LCP by the spectral projected gradient with a nonmonotone line search; no friction."""
+
+    def solve(self, problem: ImpactProblem, *, start: Floats | None = None) -> ImpactSolution:
+        """Solve one multi-impact with any restitution per contact, without friction.
+
+        Args:
+            problem: the impact.
+            start: first guess of the normal impulse [N s], shape (m,); a pull counts as 0.
+
+        Raises:
+            UnsupportedProblem: friction.
+            ProblemError: the guess has another shape or is not finite.
+        """
+        return _solution(problem, _spectral, first_guess(problem, start), self)
+
+
+def _solution(problem: ImpactProblem, method: object, guess: Floats, settings: ProjectedGradient) -> ImpactSolution:
     """Run one of the two kernels on the scaled problem, and judge what it reached."""
     if problem.has_friction:
         raise UnsupportedProblem("projected gradients have no friction here: friction must be 0 (lcp-pgs takes any)")
@@ -122,24 +112,37 @@ def _solution(
         normal, body, inverse_mass,
         J.indptr, J.indices.view(np.uint32), J_scaled, JM.indptr, JM.indices.view(np.uint32), JM_scaled,
         np.zeros(problem.n), np.zeros((inverse_mass.size, 3)),
-        scale[order], b, (scale * guess)[order], tolerance * speed, max_iterations, max_visits,
+        scale[order], b, (scale * guess)[order], settings.tolerance * speed, settings.max_iterations,
+        settings.max_visits,
     )  # fmt: skip
     impulse = np.empty(problem.m)
     impulse[order] = y
     impulse /= scale
-    return judged(problem, impulse, tolerance, iterations, visits)
+    bounded = iterations >= settings.max_iterations or visits >= settings.max_visits
+    missed = Status.ITERATION_LIMIT if bounded else Status.STALLED
+    return judged(problem, impulse, settings.tolerance, iterations, visits, missed=missed)
 
 
-def judged(problem: ImpactProblem, impulse: Floats, tolerance: float, iterations: int, visits: int) -> ImpactSolution:
-    """Make a solution whose residual and status are computed from the impulse alone, whatever its method claims."""
+def judged(
+    problem: ImpactProblem, impulse: Floats, tolerance: float, iterations: int, visits: int, *, missed: Status
+) -> ImpactSolution:
+    """Make a solution whose residual and status are computed from the impulse alone, whatever its method claims.
+
+    Args:
+        problem: the impact, without friction.
+        impulse: normal impulse [N s], shape (m,).
+        tolerance: natural-map residual up to which it counts as converged, relative to the largest |u_pre|.
+        iterations: of the method.
+        visits: contact visits.
+        missed: status of an impulse whose residual is larger.
+    """
     v = problem.v_after(impulse)
     excess = problem.J @ v + problem.restitution * problem.u_pre
     natural = np.minimum(excess, problem.W_diagonal * impulse)
     residual = float(np.abs(natural).max(initial=0.0)) / (problem.speed or 1.0)
+    status = Status.CONVERGED if residual <= tolerance else missed
     if not np.isfinite(v).all():
         status = Status.NOT_FINITE
-    else:
-        status = Status.CONVERGED if residual <= tolerance else Status.ITERATION_LIMIT
     return ImpactSolution(impulse, v, status, iterations, visits, residual)
 
 

@@ -65,17 +65,12 @@ class NewtonLcpNnls:
         A = _unit_rows(problem)
         b = (1.0 + problem.restitution) * problem.u_pre * scale
         size = float(np.abs(b).max()) or 1.0
-        z, converged = _least_distance(A, b / size, maxiter=self.max_iterations_per_contact * problem.m)
+        z, ended = _least_distance(A, b / size, maxiter=self.max_iterations_per_contact * problem.m)
         impulse = z * size * scale
-        u = problem.u_pre + problem.J @ (problem.JM.T @ impulse)
-        natural = np.minimum(u + problem.restitution * problem.u_pre, problem.W_diagonal * impulse)
-        residual = float(np.abs(natural).max()) / (problem.speed or 1.0)
-        status = Status.STALLED if residual > self.tolerance else Status.CONVERGED
-        if not converged:
-            status = Status.ITERATION_LIMIT
         pushing = int(np.count_nonzero(impulse))
+        missed = Status.STALLED if ended else Status.ITERATION_LIMIT
         # An active set changes one contact at a time: at least one product with all rows for every pushing one.
-        return ImpactSolution(impulse, problem.v_after(impulse), status, pushing, problem.m * max(pushing, 1), residual)
+        return judged(problem, impulse, self.tolerance, pushing, problem.m * max(pushing, 1), missed=missed)
 
 
 @dataclass(frozen=True)
@@ -97,7 +92,7 @@ class NewtonLcpOsqp:
         Raises:
             UnsupportedProblem: friction, or the package osqp is not installed.
         """
-        return _by_package(problem, "osqp", self._minimize, self.tolerance)
+        return _by_package(problem, "osqp", self._minimize, self.tolerance, self.max_iterations)
 
     def _minimize(self, osqp: ModuleType, P: Matrix, q: Floats, A: Matrix, b: Floats) -> tuple[Floats, Floats, int]:
         """Minimize ½ xᵀPx + qᵀx subject to A x ≥ -b; x, multipliers ≥ 0, iterations."""
@@ -136,7 +131,7 @@ class NewtonLcpClarabel:
         Raises:
             UnsupportedProblem: friction, or the package clarabel is not installed.
         """
-        return _by_package(problem, "clarabel", self._minimize, self.tolerance)
+        return _by_package(problem, "clarabel", self._minimize, self.tolerance, self.max_iterations)
 
     def _minimize(self, clarabel: ModuleType, P: Matrix, q: Floats, A: Matrix, b: Floats) -> tuple[Floats, Floats, int]:
         """Minimize ½ xᵀPx + qᵀx subject to A x ≥ -b; x, multipliers ≥ 0, iterations."""
@@ -158,8 +153,21 @@ def _by_package(
     package: str,
     minimize: Callable[[ModuleType, Matrix, Floats, Matrix, Floats], tuple[Floats, Floats, int]],
     tolerance: float,
+    max_iterations: int,
 ) -> ImpactSolution:
-    """Scale a problem, hand it to a package's method, and judge the impulse that comes back."""
+    """Scale a problem, hand it to a package's method, and judge the impulse that comes back.
+
+    Args:
+        problem: the impact.
+        package: name of the package.
+        minimize: of the package's module, P (k, k), q (k,), A (l, k) and b (l,): x (k,) that minimizes ½ xᵀPx + qᵀx
+            subject to A x ≥ -b, its multipliers ≥ 0 (l,), and iterations.
+        tolerance: natural-map residual up to which the answer counts as converged.
+        max_iterations: bound of the method.
+
+    Raises:
+        UnsupportedProblem: friction, or the package is not installed.
+    """
     if problem.has_friction:
         raise UnsupportedProblem("the quadratic program has no friction: friction must be 0")
     try:
@@ -170,7 +178,7 @@ def _by_package(
     b = (1.0 + problem.restitution) * problem.u_pre * scale
     size = float(-b.min(initial=0.0))
     if size == 0.0:
-        return judged(problem, np.zeros(problem.m), tolerance, 0, 0)
+        return judged(problem, np.zeros(problem.m), tolerance, 0, 0, missed=Status.STALLED)
     diagonal = problem.inverse_mass.diagonal()
     if problem.inverse_mass.nnz == np.count_nonzero(diagonal):
         A = sp.diags_array(scale) @ problem.J @ sp.diags_array(np.sqrt(diagonal))
@@ -179,7 +187,8 @@ def _by_package(
         W = sp.diags_array(scale) @ problem.W @ sp.diags_array(scale)
         z, _, iterations = minimize(module, W, b / size, sp.eye_array(problem.m), np.zeros(problem.m))
     impulse = np.maximum(np.nan_to_num(z, posinf=0.0, neginf=0.0), 0.0) * size * scale
-    return judged(problem, impulse, tolerance, iterations, problem.m * iterations)
+    missed = Status.ITERATION_LIMIT if iterations >= max_iterations else Status.STALLED
+    return judged(problem, impulse, tolerance, iterations, problem.m * iterations, missed=missed)
 
 
 def _unit_rows(problem: ImpactProblem) -> Floats:
@@ -197,7 +206,15 @@ def _unit_rows(problem: ImpactProblem) -> Floats:
 
 
 def _least_distance(A: Floats, b: Floats, *, maxiter: int) -> tuple[Floats, bool]:
-    """Multipliers z ≥ 0 of min ½|x|² subject to A x ≥ -b, shape (m,); False where the bound was reached.
+    """Multipliers of min ½|x|² subject to A x ≥ -b.
+
+    Args:
+        A: rows of unit length, shape (m, k), any k with A Aᵀ = W.
+        b: right-hand side, shape (m,), near one in size.
+        maxiter: bound on changes of the active set.
+
+    Returns:
+        z ≥ 0, shape (m,), and False where the bound ended it. z = 0 where nothing satisfies the constraints.
 
     `scipy.optimize.nnls` may return what is no minimum, and a residual below the least one (1.17.1: two boxes of balls
     that push on all walls). What it returns is therefore checked, and the slower `lsq_linear` asked where it fails.
@@ -213,13 +230,13 @@ def _least_distance(A: Floats, b: Floats, *, maxiter: int) -> tuple[Floats, bool
         z = np.maximum(scipy.optimize.lsq_linear(E, f, (0.0, np.inf), method="bvls", max_iter=maxiter).x, 0.0)
     remainder = 1.0 + float(b @ z)
     if not remainder > 0:
-        return np.zeros(b.size), False
+        return np.zeros(b.size), True
     z = z / remainder
     return _polished(A, b, z), True
 
 
 def _polished(A: Floats, b: Floats, z: Floats) -> Floats:
-    """Solve anew on the active set alone: the division by 1 + bᵀz costs digits where |x| is large."""
+    """Solve anew on the active set alone, shapes as in `_least_distance`: 1 + bᵀz costs digits where |x| is large."""
     active = np.flatnonzero(z > 0)
     if active.size == 0:
         return z
@@ -232,4 +249,5 @@ def _polished(A: Floats, b: Floats, z: Floats) -> Floats:
 
 
 def _natural_map(A: Floats, b: Floats, z: Floats) -> float:
+    """Residual of 0 ≤ z ⊥ A Aᵀ z + b ≥ 0, whose W = A Aᵀ has a unit diagonal."""
     return float(np.abs(np.minimum(A @ (A.T @ z) + b, z)).max())

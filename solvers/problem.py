@@ -29,6 +29,7 @@ import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components
 
 from solvers.solution import Floats
+from solvers.sphere_rows import SphereRows, pack
 
 Matrix: TypeAlias = sp.csr_array
 MatrixLike: TypeAlias = npt.ArrayLike | sp.sparray | sp.spmatrix
@@ -198,6 +199,11 @@ class ImpactProblem:
     def W_diagonal(self) -> Floats:
         """Diagonal of W [1/kg], shape (m,), > 0; computed without W."""
         return _frozen(np.asarray(self.JM.multiply(self.J).sum(axis=1), dtype=np.float64).reshape(self.m))
+
+    @cached_property
+    def spheres_at_rest(self) -> SphereRows | None:
+        """The contacts as packed rows, the bodies at rest (see `sphere_rows`); None where they have another form."""
+        return pack(self.J, self.inverse_mass)
 
     @cached_property
     def mass(self) -> Matrix:

@@ -6,7 +6,7 @@ Only neighbors with s_j < s_i matter to contact i, hence the ends are unique and
 until nothing changes gives what `qce_heap` gives, which pops the earliest end first. The speed comes from
 
 - the order: contacts are sorted, coarsely, by the end that they would have if no neighbor ended before them. Most are
-  then evaluated after all that they depend on: 1.16 (3,000 contacts) to 1.26 (183,000) evaluations an end;
+  then evaluated after all that they depend on: 1.16 (3,000 contacts) to 1.30 (183,000) evaluations an end;
 - one root: with the neighbors that end before it known, the end is the root of one quadratic about s = 0,
 
       ½ A s² + (B - F) s - ½ C = 0,   A = Σ_late c_j,  B = Σ_early c_j s_j,  C = Σ_early c_j s_j²,   c_j = W_ij F_j
@@ -18,12 +18,17 @@ until nothing changes gives what `qce_heap` gives, which pops the earliest end f
 
       A s² + Σ_{c_j > 0} c_j s_j² + Σ_{c_j < 0} c_j (2 s s_j - s_j²) > 0        (sums over early neighbors)
 
-  82 to 90 % of the evaluations pass (sphere packs); the others go through time piece by piece, as the heap does;
+  82 to 90 % of the evaluations pass (sphere packs). Where only a neighbor is on the wrong side of the root, 3 to 4 %
+  of the evaluations, the root with the others is tried; the rest go through time piece by piece, as the heap does;
 - no heap, no W: only the couplings of contacts that are active together, for one outer iteration.
 
 No slope is updated by subtraction: the couplings of all neighbors still active are summed anew in each evaluation
-(see `quadratic_contact_energy`). One thread, no random numbers, no dependence on memory addresses: the same input gives
-the same bits.
+(see `quadratic_contact_energy`).
+
+Large layers are cut into strips of contacts. Those of even number share no body and run on several threads, then those
+of odd number, which find the ends of their neighbors; what they have to say to contacts of even strips is left to one
+thread. The strips are the same for any number of threads, and so are the bits of the result: no random numbers, no
+dependence on memory addresses or on who comes first.
 
 Source: Zhang 2015, Algorithm 1, as corrected in `quadratic_contact_energy`; the fixed point is this project's.
 """
@@ -33,16 +38,18 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from solvers._jit import kernel
+from solvers._jit import alone, kernel, parallel_kernel, prange
 from solvers.problem import ImpactProblem
 from solvers.qce_heap import MAX_VISITS
 from solvers.solution import Floats
 from solvers.sphere_rows import SphereRows
 
 Ints = npt.NDArray[np.int32]
+Counts = npt.NDArray[np.int64]
 # Unsigned where an entry is itself an index: a signed one costs a test for negative ones at every access.
 Indices = npt.NDArray[np.uint32]
 Flags = npt.NDArray[np.uint8]
+Offsets = npt.NDArray[np.uint64]
 
 # Ends that differ by a few rounding errors are one: symmetric scenes have them always, and each would wake the other.
 TIE = 8 * float(np.finfo(np.float64).eps)
@@ -54,8 +61,10 @@ KEY_BITS = 48
 KEYS = 512
 # The contacts are sorted and evaluated in tiles of so many, which fit in the second-level cache with their couplings.
 # Smaller ones cost more evaluations, as neighbors in a later tile are not known: 1.37 an end with 4,096, 1.26 with
-# 8,192, 1.21 with 16,384 (kick, 183,000 contacts).
+# 8,192, 1.21 with 16,384 (kick, 183,000 contacts in one strip).
 TILE = 8192
+# So many contacts are searched, then those of them that approach are packed: they are still in the cache.
+BLOCK = 2048
 # Sweeps of a tile before the next is begun. Without the ends in later tiles two contacts can push each other's end on
 # for ever; with all of them, only a contact that never ends does.
 TILE_SWEEPS = 4
@@ -63,6 +72,12 @@ TILE_SWEEPS = 4
 SEARCH_ALL = 24
 # Rounding can make tied contacts wake each other for ever; no problem met here needed 100 sweeps beyond its contacts.
 SPARE_SWEEPS = 100
+
+# From this many contacts on sharing the work out pays: below it threads wait for one another most of the time.
+SHARED_CONTACTS = 30_000
+# Strips of contacts that threads share out, the even ones and then the odd ones; the same for any number of threads.
+MOST_STRIPS = 8
+ONE = np.uint32(1)
 
 STALLED = 1
 RESTLESS = 2
@@ -83,7 +98,19 @@ def solve_spheres(
     Returns:
         impulse [N s] in the order of `rows`, shape (m,); outer iterations; contact visits; 0, STALLED or RESTLESS.
     """
-    return _solve_spheres(rows.normal, rows.body, rows.V, threshold, defer, max_iterations, max_visits)
+    strip = _strips(rows)
+    run = _solve_spheres if strip.size > 2 else _solve_spheres_alone
+    return run(rows.normal, rows.body, rows.V, strip, threshold, defer, max_iterations, max_visits)
+
+
+def _strips(rows: SphereRows) -> Ints:
+    """Where the strips begin that threads share out, with their end; one strip where there is little to do."""
+    m = rows.normal.shape[0]
+    if m < SHARED_CONTACTS or rows.strip.size < 2:
+        return np.array([0, m], dtype=np.int32)
+    strips = rows.strip.size - 1
+    # Strips that stand together make a strip: those of even number still share no movable body.
+    return np.append(rows.strip[: -1 : -(-strips // MOST_STRIPS)], np.int32(m))
 
 
 def largest_approach(rows: SphereRows) -> float:
@@ -143,58 +170,77 @@ def _end_by_pieces(
 
 @kernel
 def _sweep(
-    size: int, order: Indices, F: Floats, own: Floats, start: Ints, neighbor: Indices, coupling: Floats,
-    end: Floats, awake: Flags, woken: Indices,
+    begin: int, stop: int, listed: int, order: Indices, F: Floats, own: Floats, start: Indices, neighbor: Indices,
+    coupling: Floats, end: Floats, awake: Flags, woken: Indices,
 ) -> int:  # fmt: skip
-    """Evaluate the listed contacts; lists those that were evaluated before and must be again, and returns how many."""
+    """Evaluate the listed contacts, all of them in one strip (from `begin` to `stop`).
+
+    Those that were evaluated before and must be again become awake; returns how many of the strip, and lists them.
+    """
     count = 0
-    for p in range(size):
+    for p in range(listed):
         k = order[p]
         before = end[k]
-        # Early neighbors are those evaluated already that end before this one did, if it was itself evaluated.
+        row, row_stop = start[k, 0], start[k, 1]
+        # Early neighbors are those evaluated already that end before this contact: as far as is known, or guessed.
         limit = min(before, NEVER)
-        A = own[k]
-        B = C = B_pull = C_pull = 0.0
-        latest = 0.0
-        following = PENDING
-        # Selections, no branches: they would be mispredicted half of the time.
-        for q in range(start[k], start[k + 1]):
-            c = coupling[q]
-            s_j = end[neighbor[q]]
-            early = s_j < limit
-            t = s_j if early else 0.0
-            A += 0.0 if early else c
-            b = c * t
-            B += b
-            C += b * t
-            pull = min(b, 0.0)
-            B_pull += pull
-            C_pull += pull * t
-            latest = t if t > latest else latest
-            late = PENDING if early else s_j
-            following = late if late < following else following
-        # The root of the quadratic, without cancellation; 0 where it has none, which is refused.
-        v = B - F[k]
-        discriminant = v * v + A * C
-        sum_of_roots = abs(v) + np.sqrt(max(discriminant, 0.0))
-        denominator = sum_of_roots if v > 0.0 else A
-        s = (C if v > 0.0 else sum_of_roots) / denominator if denominator > 0.0 else 0.0
-        rising = A * s * s + 2.0 * s * B_pull + (C - 2.0 * C_pull)
-        if not (discriminant >= 0.0 and rising > 0.0 and latest <= s and s <= following):
-            s = _end_by_pieces(F[k], own[k], start[k], start[k + 1], neighbor, coupling, end)
+        s = 0.0
+        # Whether a neighbor that ends later may not have known this end.
+        wakes = False
+        for attempt in range(2):
+            A = own[k]
+            B = C = B_pull = C_pull = 0.0
+            latest = 0.0
+            following = PENDING
+            # Selections, no branches: they would be mispredicted half of the time.
+            for q in range(row, row_stop):
+                c = coupling[q]
+                s_j = end[neighbor[q]]
+                early = s_j < limit
+                t = s_j if early else 0.0
+                A += 0.0 if early else c
+                b = c * t
+                B += b
+                C += b * t
+                pull = min(b, 0.0)
+                B_pull += pull
+                C_pull += pull * t
+                latest = t if t > latest else latest
+                late = PENDING if early else s_j
+                following = late if late < following else following
+            # The root of the quadratic, without cancellation; 0 where it has none, which is refused.
+            v = B - F[k]
+            discriminant = v * v + A * C
+            sum_of_roots = abs(v) + np.sqrt(max(discriminant, 0.0))
+            denominator = sum_of_roots if v > 0.0 else A
+            s = (C if v > 0.0 else sum_of_roots) / denominator if denominator > 0.0 else 0.0
+            rising = A * s * s + 2.0 * s * B_pull + (C - 2.0 * C_pull)
+            wakes = wakes | (latest > s) | (following < PENDING)
+            if discriminant >= 0.0 and rising > 0.0:
+                if latest <= s and s <= following:
+                    break
+                if attempt == 0:
+                    # Some are on the wrong side of this root: with those that end before it, it is right nearly always.
+                    limit = s
+                    continue
+            s = _end_by_pieces(F[k], own[k], row, row_stop, neighbor, coupling, end)
+            wakes = True
+            break
         awake[k] = 0
         earlier = min(s, before)
         if s == before or abs(s - before) <= TIE * earlier:
             continue
         end[k] = s
         # What ends after it and did not know this end.
-        if latest > earlier or following < PENDING:
-            for q in range(start[k], start[k + 1]):
+        if wakes or s > before:
+            for q in range(row, row_stop):
                 j = neighbor[q]
                 if earlier < end[j] and end[j] < PENDING and awake[j] == 0:
                     awake[j] = 1
-                    woken[count] = j
-                    count += 1
+                    # Contacts of other strips are not evaluated here.
+                    if begin <= j < stop:
+                        woken[count] = j
+                        count += 1
     return count
 
 
@@ -225,56 +271,63 @@ def _sort(begin: int, stop: int, guess: Floats, key: Ints, first: Ints, order: I
 
 @kernel
 def _settle(
-    begin: int, stop: int, size: int, left: int, F: Floats, own: Floats, slope: Floats, start: Ints,
-    neighbor: Indices, coupling: Floats, end: Floats, awake: Flags, order: Indices, woken: Indices,
+    begin: int, stop: int, tile: int, tile_stop: int, listed: int, F: Floats, own: Floats, guess: Floats,
+    start: Indices, neighbor: Indices, coupling: Floats, end: Floats, awake: Flags, order: Indices, woken: Indices,
     key: Ints, first_key: Ints,
 ) -> tuple[int, int]:  # fmt: skip
-    """Evaluate a tile and what others left over (the first entries of `order`); the last tile, until nothing changes.
+    """Evaluate a tile of a strip, and what the tiles before it left over, the first entries of `order`.
 
-    `slope` is Σ_j W_ij F_j over all neighbors; what is left in it is half of the end if none of them ended first.
+    `guess` is the end that a contact would have if none of its neighbors ended before it.
 
     Returns:
-        evaluations, and how many contacts are left over in `order`: after the last tile, 0 if a fixed point was found.
+        evaluations, and how many contacts are left over in `order`.
     """
-    for k in range(begin, stop):
-        slope[k] = F[k] / slope[k] if slope[k] > 0.0 else NEVER
-    _sort(begin, stop, slope, key, first_key, order, left)
-    left += stop - begin
+    _sort(tile, tile_stop, guess, key, first_key, order, listed)
+    listed += tile_stop - tile
     evaluations = 0
     due = order
-    for _ in range(TILE_SWEEPS if stop < size else size + SPARE_SWEEPS):
-        evaluations += left
-        left = _sweep(left, due, F, own, start, neighbor, coupling, end, awake, woken)
+    for _ in range(TILE_SWEEPS):
+        evaluations += listed
+        listed = _sweep(begin, stop, listed, due, F, own, start, neighbor, coupling, end, awake, woken)
         due, woken = woken, due
-        if left == 0:
+        if listed == 0:
             break
-    for p in range(left):
+    for p in range(listed):
         order[p] = due[p]
-    return evaluations, left
+    return evaluations, listed
 
 
 @kernel
-def _keep_fast(size: int, active: Indices, F: Floats, defer: float) -> int:
-    """Drop the contacts with F < defer · max F; returns how many are left."""
-    F_max = 0.0
-    for k in range(size):
-        F_max = max(F_max, F[k])
-    kept = 0
-    for k in range(size):
-        f = F[k]
-        active[kept] = active[k]
-        F[kept] = f
-        kept += f >= defer * F_max
-    return kept
+def _finish(
+    strip: Ints, size: Counts, F: Floats, own: Floats, start: Indices, neighbor: Indices, coupling: Floats,
+    end: Floats, awake: Flags, order: Indices, woken: Indices,
+) -> tuple[int, bool]:  # fmt: skip
+    """Evaluate what is awake in any strip until nothing changes; returns evaluations, and whether that came about."""
+    listed = 0
+    total = 0
+    for c in range(size.size):
+        total += size[c]
+        for k in range(strip[c], strip[c] + size[c]):
+            if awake[k] == 1:
+                order[listed] = k
+                listed += 1
+    evaluations = 0
+    for _ in range(total + SPARE_SWEEPS):
+        if listed == 0:
+            return evaluations, True
+        evaluations += listed
+        listed = _sweep(0, F.size, listed, order, F, own, start, neighbor, coupling, end, awake, woken)
+        order, woken = woken, order
+    return evaluations, False
 
 
 @kernel
-def _all_end(size: int, end: Floats) -> bool:
+def _all_end(begin: int, stop: int, end: Floats) -> bool:
     """False where a contact never ends: it would leave work behind, and the outer iteration is not applied."""
     ended = 0
-    for k in range(size):
+    for k in range(begin, stop):
         ended += end[k] < NEVER
-    return ended == size
+    return ended == stop - begin
 
 
 @kernel
@@ -297,42 +350,67 @@ def _largest_approach(normal: Floats, body: Indices, V: Floats) -> float:
 
 
 @kernel
-def _search(normal: Floats, body: Indices, V: Floats, threshold: float, found: Indices, F: Floats) -> int:
-    """List the contacts that approach, and how fast; returns how many."""
-    size = 0
+def _search(
+    begin: int, stop: int, first: int, normal: Floats, body: Indices, V: Floats, threshold: float,
+    found: Indices, F: Floats,
+) -> int:  # fmt: skip
+    """List those of some contacts that approach, from place `first` on, and how fast; returns where the list ends."""
+    size = np.uint64(first)
     # No branch here: one contact in five approaches, at random.
-    for i in range(body.shape[0]):
+    for i in range(np.uint64(begin), np.uint64(stop)):
         F_i = _approach(normal, body, V, i)
         found[size] = i
         F[size] = F_i
-        size += F_i > threshold
-    return size
+        size += np.uint64(F_i > threshold)
+    return int(size)
 
 
 @kernel
 def _search_nearby(
     normal: Floats, body: Indices, V: Floats, threshold: float, found: Indices, F: Floats,
-    moved: int, pair: Indices, span: Indices, contact_of: Indices, seen: Ints, iteration: int,
+    strip: Ints, size: Counts, pair: Indices, span: Indices, contact_of: Indices, seen: Ints, iteration: int,
 ) -> tuple[int, int]:  # fmt: skip
-    """Search around the bodies that the last outer iteration moved; returns how many approach and were looked at."""
-    size = 0
+    """Search around the bodies that the last outer iteration moved, and list what approaches in the first strip.
+
+    Returns:
+        how many approach, and how many were looked at.
+    """
+    count = 0
     looked = 0
-    for k in range(moved):
-        for side in range(2):
-            b = pair[k, side]
-            if not V[b, 3] > 0.0:
-                continue
-            for q in range(span[b, 0], span[b + 1, 0]):
-                i = contact_of[q]
-                if seen[i] == iteration:
+    for c in range(size.size):
+        for k in range(strip[c], strip[c] + size[c]):
+            for side in range(2):
+                b = pair[k, side]
+                if not V[b, 3] > 0.0:
                     continue
-                seen[i] = iteration
-                looked += 1
-                F_i = _approach(normal, body, V, i)
-                found[size] = i
-                F[size] = F_i
-                size += F_i > threshold
-    return size, looked
+                for q in range(span[b, 0], span[b + 1, 0]):
+                    i = contact_of[q]
+                    if seen[i] == iteration:
+                        continue
+                    seen[i] = iteration
+                    looked += 1
+                    F_i = _approach(normal, body, V, i)
+                    found[count] = i
+                    F[count] = F_i
+                    count += F_i > threshold
+    return count, looked
+
+
+@kernel
+def _keep_fast(strip: Ints, size: Counts, found: Indices, F: Floats, defer: float) -> None:
+    """Drop the contacts with F < defer · max F."""
+    F_max = 0.0
+    for c in range(size.size):
+        for k in range(strip[c], strip[c] + size[c]):
+            F_max = max(F_max, F[k])
+    for c in range(size.size):
+        kept = strip[c]
+        for k in range(strip[c], strip[c] + size[c]):
+            f = F[k]
+            found[kept] = found[k]
+            F[kept] = f
+            kept += f >= defer * F_max
+        size[c] = kept - strip[c]
 
 
 @kernel
@@ -365,196 +443,243 @@ def _contacts_of_bodies(body: Indices, span: Indices) -> Indices:
 
 @kernel
 def _enlist(
-    size: int, found: Indices, F: Floats, normal: Floats, body: Indices, V: Floats, span: Indices,
-    member: Indices, n: Floats, pair: Indices, own: Floats, slope: Floats, end: Floats, awake: Flags,
-) -> None:  # fmt: skip
-    """Pack the active contacts, and list them (twice their number, plus their side) with each movable body."""
-    for k in range(size):
+    begin: int, stop: int, found: Indices, F: Floats, normal: Floats, body: Indices, V: Floats, span: Indices,
+    member: Indices, near: Floats, pair: Indices, end: Floats, awake: Flags,
+) -> int:  # fmt: skip
+    """Pack some active contacts, and list them (twice their number, plus their side) with each movable body.
+
+    Returns:
+        how many couplings they have with one another and with those listed before, both ways.
+    """
+    met = np.uint64(0)
+    for k in range(np.uint64(begin), np.uint64(stop)):
         i = found[k]
-        inverse_mass = 0.0
         for side in range(2):
             b = body[i, side]
             pair[k, side] = b
-            count = span[b, 1]
-            member[span[b, 0] + count] = 2 * k + side
-            span[b, 1] = count + (V[b, 3] > 0.0)
-            inverse_mass += V[b, 3]
-        x, y, z = normal[i, 0], normal[i, 1], normal[i, 2]
-        n[k, 0], n[k, 1], n[k, 2] = x, y, z
-        own[k] = (x * x + y * y + z * z) * inverse_mass * F[k]
-        slope[k] = own[k]
+            # The immovable body is every strip's: threads must not write to it.
+            if V[b, 3] > 0.0:
+                count = span[b, 1]
+                member[span[b, 0] + count] = k + k + np.uint64(side)
+                span[b, 1] = count + ONE
+                met += np.uint64(count)
+        for axis in range(3):
+            near[k, axis] = normal[i, axis]
+        near[k, 3] = F[k]
         end[k] = PENDING
         awake[k] = 1
+    return 2 * int(met)
 
 
 @kernel
-def _lay_out(
-    size: int, pair: Indices, V: Floats, span: Indices, member: Indices, start: Ints, fill: Ints,
-    shared: Indices, reach: Ints,
-) -> int:  # fmt: skip
-    """Where each contact's couplings begin, and the bodies with several active contacts; returns how many couplings.
+def _list_strip(
+    begin: int, stop: int, normal: Floats, body: Indices, V: Floats, threshold: float, found: Indices, F: Floats,
+    span: Indices, member: Indices, near: Floats, pair: Indices, end: Floats, awake: Flags,
+) -> tuple[int, int]:  # fmt: skip
+    """Search a strip and pack what approaches; returns how many, and the couplings that they met (see `_enlist`)."""
+    listed = begin
+    met = 0
+    for block in range(begin, stop, BLOCK):
+        grown = _search(block, min(block + BLOCK, stop), listed, normal, body, V, threshold, found, F)
+        # What was searched is still in the cache.
+        met += _enlist(listed, grown, found, F, normal, body, V, span, member, near, pair, end, awake)
+        listed = grown
+    return listed - begin, met
 
-    Bodies are listed in the order of their first contact, and `reach` says how many each tile has, with all before.
+
+@kernel
+def _places(met: Counts, place: Offsets) -> None:
+    """Where the couplings of each strip begin at the latest, and an end behind the last.
+
+    A coupling between strips was counted, both ways, with the odd one, which was listed later.
     """
-    row = 0
-    count = 0
-    for tile in range((size - 1) // TILE + 1):
-        for k in range(tile * TILE, min(tile * TILE + TILE, size)):
-            start[k] = row
-            fill[k] = row
-            for side in range(2):
-                b = pair[k, side]
-                others = span[b, 1] - (1 if V[b, 3] > 0.0 else 0)
-                row += others
-                shared[count] = b
-                count += (others > 0) & (member[span[b, 0]] >> 1 == k)
-        reach[tile] = count
-    start[size] = row
-    return row
+    strips = met.size
+    for c in range(strips):
+        most = met[c]
+        if c % 2 == 0:
+            most += ((met[c - 1] if c > 0 else 0) + (met[c + 1] if c + 1 < strips else 0)) // 2
+        # One place more: what is written behind the last row is not read.
+        place[c + 1] = place[c] + np.uint64(most + 1)
 
 
 @kernel
 def _couple(
-    begin: int, stop: int, shared: Indices, F: Floats, n: Floats, V: Floats, span: Indices, member: Indices,
-    near: Floats, near_contact: Indices, fill: Ints, neighbor: Indices, coupling: Floats, slope: Floats,
-) -> None:  # fmt: skip
-    """Couplings W_ij F_j of the contacts of some bodies."""
-    spare = neighbor.size - 1
-    for t in range(begin, stop):
-        b = shared[t]
-        first = span[b, 0]
-        count = span[b, 1]
-        for p in range(count):
-            k = member[first + p] >> 1
-            sign = 1.0 if member[first + p] & 1 else -1.0
-            near_contact[p] = k
-            for axis in range(3):
-                near[p, axis] = sign * n[k, axis]
-            near[p, 3] = F[k] * V[b, 3]
-        for p in range(count):
-            k = near_contact[p]
-            to = fill[k]
-            w = slope[k]
-            for q in range(count):
-                c = (near[p, 0] * near[q, 0] + near[p, 1] * near[q, 1] + near[p, 2] * near[q, 2]) * near[q, 3]
-                # No branch: what a contact does to itself goes to a place that nobody reads.
-                here = spare if p == q else to
-                neighbor[here] = near_contact[q]
-                coupling[here] = c
-                w += 0.0 if p == q else c
-                to += p != q
-            fill[k] = to
-            slope[k] = w
+    begin: int, stop: int, row: np.uint64, near: Floats, pair: Indices, V: Floats, span: Indices, member: Indices,
+    start: Indices, neighbor: Indices, coupling: Floats, own: Floats, guess: Floats,
+) -> np.uint64:  # fmt: skip
+    """Couplings W_ij F_j of some active contacts, written from `row` on; returns where they end."""
+    for k in range(np.uint64(begin), np.uint64(stop)):
+        start[k, 0] = row
+        x, y, z, F = near[k, 0], near[k, 1], near[k, 2], near[k, 3]
+        slope = 0.0
+        for side in range(2):
+            b = pair[k, side]
+            w = V[b, 3] if side == 1 else -V[b, 3]
+            wx, wy, wz = w * x, w * y, w * z
+            for q in range(span[b, 0], span[b, 0] + span[b, 1]):
+                j = np.uint32(member[q] >> ONE)
+                F_j = near[j, 3] if member[q] & ONE else -near[j, 3]
+                c = (wx * near[j, 0] + wy * near[j, 1] + wz * near[j, 2]) * F_j
+                # No branch: what a contact does to itself is overwritten, or stands behind the last row.
+                neighbor[row] = j
+                coupling[row] = c
+                slope += c
+                row += np.uint64(j != k)
+        start[k, 1] = row
+        own[k] = (x * x + y * y + z * z) * (V[pair[k, 0], 3] + V[pair[k, 1], 3]) * F
+        guess[k] = F / slope if slope > 0.0 else NEVER
+    return row
 
 
 @kernel
 def _apply(
-    size: int, found: Indices, F: Floats, end: Floats, n: Floats, pair: Indices, V: Floats, span: Indices,
+    begin: int, stop: int, found: Indices, near: Floats, end: Floats, pair: Indices, V: Floats, span: Indices,
     impulse: Floats,
 ) -> None:  # fmt: skip
     """Apply the impulses of one outer iteration, and take its contacts off the bodies' lists."""
-    for k in range(size):
-        P = F[k] * end[k]
+    for k in range(np.uint64(begin), np.uint64(stop)):
+        P = near[k, 3] * end[k]
         impulse[found[k]] += P
         for side in range(2):
             b = pair[k, side]
-            span[b, 1] = 0
-            dv = (P if side == 1 else -P) * V[b, 3]
-            for axis in range(3):
-                V[b, axis] += dv * n[k, axis]
+            if V[b, 3] > 0.0:
+                span[b, 1] = 0
+                dv = (P if side == 1 else -P) * V[b, 3]
+                for axis in range(3):
+                    V[b, axis] += dv * near[k, axis]
 
 
 @kernel
-def _most_contacts(span: Indices, V: Floats) -> int:
-    """Contacts of the movable body that has most; the last body is immovable."""
-    most = 0
-    for b in range(span.shape[0] - 1):
-        if V[b, 3] > 0.0:
-            most = max(most, int(np.int64(span[b + 1, 0] - span[b, 0])))
-    return most
+def _settle_strip(
+    begin: int, stop: int, row: np.uint64, near: Floats, pair: Indices, V: Floats, span: Indices, member: Indices,
+    F: Floats, own: Floats, guess: Floats, start: Indices, neighbor: Indices, coupling: Floats, end: Floats,
+    awake: Flags, order: Indices, woken: Indices, key: Ints, first_key: Ints,
+) -> int:  # fmt: skip
+    """Couple and evaluate the active contacts of a strip, tile by tile; returns the number of evaluations."""
+    total = 0
+    listed = 0
+    for tile in range(begin, stop, TILE):
+        tile_stop = min(tile + TILE, stop)
+        row = _couple(
+            tile, tile_stop, row, near, pair, V, span, member, start, neighbor, coupling, own, guess
+        )  # fmt: skip
+        # Its couplings are still in the cache.
+        evaluations, listed = _settle(
+            begin, stop, tile, tile_stop, listed, F, own, guess, start, neighbor, coupling, end, awake,
+            order, woken, key, first_key,
+        )  # fmt: skip
+        total += evaluations
+    return total
 
 
-@kernel
+@parallel_kernel
 def _solve_spheres(
-    normal: Floats, body: Indices, V: Floats, threshold: float, defer: float, max_iterations: int, max_visits: int
-) -> tuple[Floats, int, int, int]:
+    normal: Floats, body: Indices, V: Floats, strip: Ints,
+    threshold: float, defer: float, max_iterations: int, max_visits: int,
+) -> tuple[Floats, int, int, int]:  # fmt: skip
     """Outer iterations on packed contacts (V is changed)."""
     m = normal.shape[0]
+    strips = strip.size - 1
     impulse = np.zeros(m)
-    # Per body: its span of all contacts, its active ones, and what `_couple` reads of those of one body.
+    # Per body: its span of all contacts, and its active ones.
     span = _spans(body, V.shape[0])
     member = np.empty(2 * m, np.uint32)
-    shared = np.empty(V.shape[0] + 1, np.uint32)
-    reach = np.empty(m // TILE + 1, np.int32)
-    most = _most_contacts(span, V)
-    near = np.empty((most, 4))
-    near_contact = np.empty(most, np.uint32)
-    # Per active contact; memory that no iteration needs is never touched.
-    found = np.empty(m + 1, np.uint32)
-    F = np.empty(m + 1)
-    n = np.empty((m, 3))
+    # Per active contact, those of each strip from its first place on; memory that is not needed is never touched.
+    found = np.empty(m, np.uint32)
+    F = np.empty(m)
+    near = np.empty((m, 4))
     pair = np.empty((m, 2), np.uint32)
     own = np.empty(m)
-    slope = np.empty(m)
+    guess = np.empty(m)
     end = np.empty(m)
     awake = np.empty(m, np.uint8)
-    start = np.empty(m + 1, np.int32)
-    fill = np.empty(m, np.int32)
+    start = np.empty((m, 2), np.uint32)
     order = np.empty(m, np.uint32)
     woken = np.empty(m, np.uint32)
-    first_key = np.empty(KEYS + 1, np.int32)
-    neighbor = np.empty(1, np.uint32)
-    coupling = np.empty(1)
+    key = np.empty(m, np.int32)
+    neighbor = np.empty(0, np.uint32)
+    coupling = np.empty(0)
+    # Per strip: active contacts, couplings that they met when listed, where theirs begin, evaluations.
+    size = np.zeros(strips, np.int64)
+    met = np.zeros(strips, np.int64)
+    place = np.zeros(strips + 1, np.uint64)
+    evaluated = np.zeros(strips, np.int64)
+    first_key = np.empty((strips, KEYS + 1), np.int32)
     # What only a search by neighborhood needs.
     contact_of = np.empty(0, np.uint32)
     seen = np.empty(0, np.int32)
-    size = 0
     visits = 0
     iterations = 0
     everywhere = True
     while iterations < max_iterations and visits < max_visits:
         if everywhere:
-            size = _search(normal, body, V, threshold, found, F)
             visits += m
+            for parity in range(2):
+                for half in prange((strips + 1 - parity) // 2):
+                    c = int(2 * np.int64(half) + parity)
+                    if defer == 0.0:
+                        size[c], met[c] = _list_strip(
+                            strip[c], strip[c + 1], normal, body, V, threshold, found, F,
+                            span, member, near, pair, end, awake,
+                        )  # fmt: skip
+                    else:
+                        listed = _search(strip[c], strip[c + 1], strip[c], normal, body, V, threshold, found, F)
+                        size[c] = listed - strip[c]
         else:
             if seen.size == 0:
                 contact_of = _contacts_of_bodies(body, span)
                 seen = np.zeros(m, np.int32)
-            size, looked = _search_nearby(
-                normal, body, V, threshold, found, F, size, pair, span, contact_of, seen, iterations
+            count, looked = _search_nearby(
+                normal, body, V, threshold, found, F, strip, size, pair, span, contact_of, seen, iterations
             )
             visits += looked
-        if size == 0:
+            size[:] = 0
+            met[:] = 0
+            size[0] = count
+            met[0] = _enlist(0, count, found, F, normal, body, V, span, member, near, pair, end, awake)
+        total = int(size.sum())
+        if total == 0:
             break
         iterations += 1
         if defer > 0.0:
-            size = _keep_fast(size, found, F, defer)
-        everywhere = defer > 0.0 or size * SEARCH_ALL > m
-        visits += size
-        _enlist(size, found, F, normal, body, V, span, member, n, pair, own, slope, end, awake)
-        couplings = _lay_out(size, pair, V, span, member, start, fill, shared, reach)
-        if couplings >= neighbor.size:
-            neighbor = np.empty(couplings + couplings // 8 + 8, np.uint32)
+            _keep_fast(strip, size, found, F, defer)
+            for parity in range(2):
+                for c in range(parity, strips, 2):
+                    met[c] = _enlist(
+                        strip[c], strip[c] + size[c], found, F, normal, body, V, span, member, near, pair, end, awake
+                    )  # fmt: skip
+            total = int(size.sum())
+        everywhere = defer > 0.0 or total * SEARCH_ALL > m
+        visits += total
+        _places(met, place)
+        if place[strips] > coupling.size:
+            neighbor = np.empty(place[strips] + place[strips] // np.uint64(8), np.uint32)
             coupling = np.empty(neighbor.size)
-        coupled = 0
-        left = 0
-        for tile in range((size - 1) // TILE + 1):
-            _couple(
-                coupled, reach[tile], shared, F, n, V, span, member, near, near_contact, fill, neighbor, coupling, slope
-            )
-            coupled = reach[tile]
-            # The tile's part of `fill` has served; its couplings are still in the cache.
-            evaluations, left = _settle(
-                tile * TILE, min(tile * TILE + TILE, size), size, left, F, own, slope, start,
-                neighbor, coupling, end, awake, order, woken, fill, first_key,
-            )  # fmt: skip
-            visits += evaluations
-        if left > 0:
+        for parity in range(2):
+            for half in prange((strips + 1 - parity) // 2):
+                c = int(2 * np.int64(half) + parity)
+                stop = strip[c] + size[c]
+                evaluated[c] = _settle_strip(
+                    strip[c], stop, place[c], near, pair, V, span, member, F, own, guess, start,
+                    neighbor, coupling, end, awake, order[strip[c] : stop], woken[strip[c] : stop], key, first_key[c],
+                )  # fmt: skip
+        evaluations, settled = _finish(
+            strip, size, F, own, start, neighbor, coupling, end, awake, order, woken
+        )  # fmt: skip
+        visits += int(evaluated.sum()) + evaluations
+        if not settled:
             return impulse, iterations, visits, RESTLESS
-        if not _all_end(size, end):
-            return impulse, iterations, visits, STALLED
-        _apply(size, found, F, end, n, pair, V, span, impulse)
+        for c in range(strips):
+            if not _all_end(strip[c], strip[c] + size[c], end):
+                return impulse, iterations, visits, STALLED
+        for parity in range(2):
+            for half in prange((strips + 1 - parity) // 2):
+                c = int(2 * np.int64(half) + parity)
+                _apply(strip[c], strip[c] + size[c], found, near, end, pair, V, span, impulse)
     return impulse, iterations, visits, 0
+
+
+_solve_spheres_alone = alone(_solve_spheres)
 
 
 @kernel
@@ -600,16 +725,16 @@ def _enlist_sparse(
 
 @kernel
 def _couple_sparse(
-    size: int, found: Indices, JM_start: Ints, JM_index: Indices, JM: Floats, first: Ints, count: Ints,
-    record: Floats, record_of: Indices, met: Ints, own: Floats, slope: Floats, end: Floats, awake: Flags,
-    start: Ints, neighbor: Indices, coupling: Floats,
+    size: int, found: Indices, F: Floats, JM_start: Ints, JM_index: Indices, JM: Floats, first: Ints, count: Ints,
+    record: Floats, record_of: Indices, met: Ints, own: Floats, guess: Floats, end: Floats, awake: Flags,
+    start: Indices, neighbor: Indices, coupling: Floats,
 ) -> tuple[Indices, Floats]:  # fmt: skip
     """Couplings W_ij F_j of all active contacts; returns their arrays, made larger where they were too small."""
     row = 0
     met[:size] = -1
     for k in range(size):
         i = found[k]
-        start[k] = row
+        start[k, 0] = row
         if row + size > neighbor.size:
             more = np.empty(2 * neighbor.size + size, np.uint32)
             more[:row] = neighbor[:row]
@@ -636,11 +761,11 @@ def _couple_sparse(
                 else:
                     coupling[met[j]] += c
         own[k] = own_k
-        slope[k] = w
+        start[k, 1] = stop
+        guess[k] = F[k] / w if w > 0.0 else NEVER
         end[k] = PENDING
         awake[k] = 1
         row = stop
-    start[size] = row
     return neighbor, coupling
 
 
@@ -673,19 +798,22 @@ def _solve_sparse(
     record = np.empty(J.size)
     record_of = np.empty(J.size, np.uint32)
     # Per active contact.
-    found = np.empty(m + 1, np.uint32)
-    F = np.empty(m + 1)
+    found = np.empty(m, np.uint32)
+    F = np.empty(m)
     own = np.empty(m)
-    slope = np.empty(m)
+    guess = np.empty(m)
     end = np.empty(m)
     awake = np.empty(m, np.uint8)
-    start = np.empty(m + 1, np.int32)
+    start = np.empty((m, 2), np.uint32)
     met = np.empty(m, np.int32)
     order = np.empty(m, np.uint32)
     woken = np.empty(m, np.uint32)
     first_key = np.empty(KEYS + 1, np.int32)
     neighbor = np.empty(8 * m + 8, np.uint32)
     coupling = np.empty(8 * m + 8)
+    # All contacts are one strip.
+    strip = np.zeros(1, np.int32)
+    sizes = np.zeros(1, np.int64)
     visits = 0
     iterations = 0
     while iterations < max_iterations and visits < max_visits:
@@ -694,25 +822,31 @@ def _solve_sparse(
         if size == 0:
             break
         iterations += 1
+        sizes[0] = size
         if defer > 0.0:
-            size = _keep_fast(size, found, F, defer)
+            _keep_fast(strip, sizes, found, F, defer)
+            size = int(sizes[0])
         visits += size
         _enlist_sparse(size, found, F, J_start, J_index, J, first, count, record, record_of)
         neighbor, coupling = _couple_sparse(
-            size, found, JM_start, JM_index, JM, first, count, record, record_of, met, own, slope, end, awake,
+            size, found, F, JM_start, JM_index, JM, first, count, record, record_of, met, own, guess, end, awake,
             start, neighbor, coupling,
         )  # fmt: skip
-        left = 0
-        for begin in range(0, size, TILE):
+        listed = 0
+        for tile in range(0, size, TILE):
             # `met` has served: it takes the sorting keys.
-            evaluations, left = _settle(
-                begin, min(begin + TILE, size), size, left, F, own, slope, start,
+            evaluations, listed = _settle(
+                0, size, tile, min(tile + TILE, size), listed, F, own, guess, start,
                 neighbor, coupling, end, awake, order, woken, met, first_key,
             )  # fmt: skip
             visits += evaluations
-        if left > 0:
+        evaluations, settled = _finish(
+            strip, sizes, F, own, start, neighbor, coupling, end, awake, order, woken
+        )  # fmt: skip
+        visits += evaluations
+        if not settled:
             return impulse, iterations, visits, RESTLESS
-        if not _all_end(size, end):
+        if not _all_end(0, size, end):
             return impulse, iterations, visits, STALLED
         _apply_sparse(size, found, F, end, JM_start, JM_index, JM, v, impulse)
     return impulse, iterations, visits, 0

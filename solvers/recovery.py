@@ -13,19 +13,17 @@ either: the change of energy is q(Δλ) = Δλᵀ J v_e + ½ Δλᵀ W Δλ, the
 gradients lower from q(0) = 0 at each step. Impulses stay >= 0 and momentum is kept, as Δλ >= 0 is an impulse of the
 same contacts. Friction impulses stay within their bounds, as the normal impulses only grow.
 
-The energy that the inelastic part takes is lost, so this is a policy and no law: off unless it is asked for, and the
-status still says that the elastic law did not end.
+The energy that the inelastic part takes is lost, so this is a policy and no law: off unless it is asked for (setting
+`recover_after` of `qce` and `gr`), and the status still says that the elastic law did not end.
 """
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import numpy as np
 
 from solvers import boxed_lcp
 from solvers.problem import ImpactProblem
-from solvers.solution import ImpactSolution, Solver, Status
+from solvers.solution import ImpactSolution, Status
 
 # Natural-map residual of the inelastic LCP, relative to the largest |u_pre|: that of the laws' own inelastic LCPs.
 TOLERANCE = 1e-12
@@ -71,28 +69,3 @@ def resolve(
         max(0.0, -u_min) / (problem.speed or 1.0),
         solution.friction_impulse,
     )
-
-
-@dataclass(frozen=True)
-class Recovered:
-    """A law whose unfinished answers are recovered; bound the law's iterations by its own setting.
-
-    `Recovered(QuadraticContactEnergy(max_iterations=100))` is 100 elastic iterations, then one inelastic LCP.
-    """
-
-    law: Solver
-    """The law, with its own settings."""
-
-    tolerance: float = TOLERANCE
-    """Natural-map residual of the inelastic LCP, relative to the largest |u_pre|."""
-
-    max_sweeps: int = MAX_SWEEPS
-    """Bound on the sweeps of the inelastic LCP."""
-
-    def solve(self, problem: ImpactProblem) -> ImpactSolution:
-        """Solve one multi-impact and recover it where the law did not end.
-
-        Raises:
-            UnsupportedProblem: the law refuses the problem.
-        """
-        return resolve(problem, self.law.solve(problem), tolerance=self.tolerance, max_sweeps=self.max_sweeps)

@@ -8,18 +8,24 @@ from J's sparsity, whatever it was made from; a row on one body has the last, im
 
 Large problems are renumbered on the way: bodies in breadth-first order of the contact graph, contacts in the order in
 which that search meets them, so that neighbors in space are neighbors in memory.
+
+Packing and renumbering read the geometry alone: a problem keeps what comes of them (36 bytes a contact, and 36 a body),
+and every solve starts from a copy of the velocities.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from solvers._jit import kernel
-from solvers.problem import ImpactProblem
 from solvers.solution import Floats
+
+if TYPE_CHECKING:
+    from solvers.problem import ImpactProblem, Matrix
 
 Ints = npt.NDArray[np.int32]
 # Unsigned, because a signed index costs a test for negative ones at every access: 25 % of a scan (measured).
@@ -27,6 +33,8 @@ Indices = npt.NDArray[np.uint32]
 
 # Below this many contacts everything fits in the cache and a renumbering does not pay.
 RENUMBERED = 8_000
+# Strips of contacts that threads share out; the same for any number of threads.
+STRIPS = 8
 
 
 @dataclass(frozen=True)
@@ -48,6 +56,10 @@ class SphereRows:
     owner: Ints = field(default_factory=lambda: np.empty(0, np.int32))
     """The problem's number of each body, shape (bodies + 1,); empty for rows that come without an `ImpactProblem`."""
 
+    strip: Ints = field(default_factory=lambda: np.zeros(1, np.int32))
+    """Where strips of contacts begin, shape (strips + 1,), their last entry the end: those of even number share no
+    movable body, nor do those of odd number. Empty where none are known."""
+
     def in_problem_order(self, per_contact: Floats) -> Floats:
         """Put an array over these contacts, shape (m,), in the problem's order."""
         ordered = np.empty_like(per_contact)
@@ -63,36 +75,53 @@ class SphereRows:
 
 
 def sphere_rows(problem: ImpactProblem) -> SphereRows | None:
-    """Pack a problem; None where it has another form."""
-    inverse_mass = problem.inverse_mass
-    if inverse_mass.nnz > problem.n:
+    """Pack a problem; None where it has another form. Only `V` is the caller's own: the problem keeps the rest."""
+    still = problem.spheres_at_rest
+    if still is None:
+        return None
+    bodies = still.owner[:-1]
+    V = still.V.copy()
+    width = problem.n // max(bodies.size, 1)
+    V[:-1, :width] = problem.v_pre.reshape(bodies.size, width)[bodies]
+    return replace(still, V=V)
+
+
+def pack(J: Matrix, inverse_mass: Matrix) -> SphereRows | None:
+    """Pack contacts and bodies, with velocities of zero; None where a row, or a mass, has another form.
+
+    Args:
+        J: contact Jacobian, shape (m, n).
+        inverse_mass: M⁻¹ [1/kg], shape (n, n).
+    """
+    n = J.shape[1]
+    if inverse_mass.nnz > n:
         return None
     diagonal = inverse_mass.diagonal()
     if inverse_mass.nnz != np.count_nonzero(diagonal):
         return None
     for width in (3, 2, 1):
-        if problem.n % width == 0 and (diagonal.reshape(-1, width) == diagonal[::width, None]).all():
-            rows = _packed(problem, width, diagonal[::width])
+        if n % width == 0 and (diagonal.reshape(-1, width) == diagonal[::width, None]).all():
+            rows = _packed(J, width, diagonal[::width])
             if rows is not None:
                 return rows
     return None
 
 
-def _packed(problem: ImpactProblem, width: int, inverse_mass: Floats) -> SphereRows | None:
+def _packed(J: Matrix, width: int, inverse_mass: Floats) -> SphereRows | None:
     """Pack with bodies of `width` velocities each; None where a row has another form."""
-    J = problem.J
-    normal = np.zeros((problem.m, 3))
-    body = np.empty((problem.m, 2), np.uint32)
+    m = J.shape[0]
+    normal = np.zeros((m, 3))
+    body = np.empty((m, 2), np.uint32)
     bodies = inverse_mass.size
     if not _pack(J.indptr, J.indices, J.data, width, bodies, normal, body):
         return None
     V = np.zeros((bodies + 1, 4))
-    V[:bodies, :width] = problem.v_pre.reshape(bodies, width)
     V[:bodies, 3] = inverse_mass
-    if problem.m < RENUMBERED:
-        every = np.arange(max(problem.m, bodies + 1), dtype=np.int32)
-        return SphereRows(normal, body, V, every[: problem.m], every[: bodies + 1])
-    return SphereRows(*_renumber(normal, body, V))
+    if m < RENUMBERED:
+        every = np.arange(max(m, bodies + 1), dtype=np.int32)
+        return SphereRows(normal, body, V, every[:m], every[: bodies + 1])
+    normal, body, V, contact, owner = _renumber(normal, body, V)
+    return SphereRows(normal, body, V, contact, owner, _strips(body, V))
 
 
 @kernel
@@ -209,6 +238,31 @@ def _renumber(normal: Floats, body: Indices, V: Floats) -> tuple[Floats, Indices
         for column in range(4):
             new_V[k, column] = V[order[k], column]
     return new_normal, new_body, new_V, contact, order
+
+
+@kernel
+def _strips(body: Indices, V: Floats) -> Ints:
+    """Cut the contacts into strips; into one where those of even number, or of odd, would share a movable body."""
+    m = body.shape[0]
+    bodies = V.shape[0]
+    strip = np.empty(STRIPS + 1, np.int32)
+    low = np.full(STRIPS + 2, bodies, np.int64)
+    high = np.full(STRIPS, -1, np.int64)
+    for c in range(STRIPS + 1):
+        strip[c] = m * c // STRIPS
+    for c in range(STRIPS):
+        for i in range(strip[c], strip[c + 1]):
+            for side in range(2):
+                b = body[i, side]
+                if V[b, 3] > 0.0:
+                    low[c] = min(low[c], np.int64(b))
+                    high[c] = max(high[c], np.int64(b))
+    for c in range(STRIPS - 1, -1, -1):
+        # The lowest of this strip and of all after it with the same parity.
+        if high[c] >= low[c + 2]:
+            return np.array([0, m], np.int32)
+        low[c] = min(low[c], low[c + 2])
+    return strip
 
 
 def sparse_rows(rows: SphereRows) -> tuple[Ints, Indices, Floats, Ints, Indices, Floats]:

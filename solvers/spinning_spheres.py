@@ -12,6 +12,10 @@ bodies are read once for three rows. Contacts come in stripes; those of stripes 
 those of 1, 3, 5, …, so that each half runs on all threads and gives the same bits on any number of them.
 
 Residual: the natural map, as in `boxed_lcp`, over the largest |u_pre|.
+
+Sweeps that end before they converge may leave more kinetic energy than there was: ΔK(α) = α p·u_pre + ½ α² p·Wp for a
+share α of all impulses p. The share is then cut to the root of ΔK, α = -2 p·u_pre / p·Wp < 1: nothing is gained, no
+momentum is lost, every impulse stays in its bounds, and an answer that gains nothing is left alone.
 """
 
 from __future__ import annotations
@@ -22,6 +26,7 @@ import numpy as np
 import numpy.typing as npt
 
 from solvers._jit import kernel, parallel_kernel, prange
+from solvers.buffers import Buffers
 from solvers.solution import Floats
 
 Ints = npt.NDArray[np.int32]
@@ -30,10 +35,11 @@ Indices = npt.NDArray[np.uint32]
 
 # Closer to the vertical than this, a normal leaves no usable horizontal direction beside it.
 VERTICAL = 1e-9
-# Columns of a row: normal, horizontal tangent (x, y), 1 / W_ii, target, λ, λ₁, λ₂, u before, unused.
-NORMAL, TANGENT, FREEDOM, TARGET, PUSH, RUB, RUB_2, BEFORE, COLUMNS = 0, 3, 5, 6, 7, 8, 9, 10, 12
-# What a stripe reports: residual [m/s], work of the normal impulses [J], largest change of a sweep [m/s].
-RESIDUAL, WORK, CHANGE = 0, 1, 2
+# Columns of a row: normal, horizontal tangent (x, y), 1 / W_ii, target, λ. It fills a line of the cache; what only
+# contacts that press need is elsewhere.
+NORMAL, TANGENT, FREEDOM, TARGET, PUSH, COLUMNS = 0, 3, 5, 6, 7, 8
+# What a stripe reports: residual [m/s], largest change of a sweep [m/s], λ·u and p·u of all rows before and after [J].
+RESIDUAL, CHANGE, PUSH_BEFORE, PUSH_AFTER, ALL_BEFORE, ALL_AFTER, REPORTS = 0, 1, 2, 3, 4, 5, 6
 
 
 @dataclass(frozen=True)
@@ -64,11 +70,13 @@ class SpinningResult:
     """Natural map [m/s]."""
     normal_work: float
     """Work of the normal impulses, Σ λ (u_pre + u_post) / 2 [J]: the energy that restitution takes."""
+    share: float
+    """Share of the sweeps' impulses that was taken, 1 unless they gained energy."""
 
 
 def sweep_spheres(
     rows: SpinningRows, target: Floats, start: Floats, *, friction: float, inertia: float, tolerance: float,
-    max_sweeps: int,
+    max_sweeps: int, buffers: Buffers | None = None,
 ) -> SpinningResult:  # fmt: skip
     """Solve the LCP with friction from given impulses; `rows.motion` is changed to the velocities after it.
 
@@ -80,21 +88,36 @@ def sweep_spheres(
         inertia: κ = m r² / I, 2.5 for solid spheres.
         tolerance: natural-map residual at which to stop [m/s]; it is measured when a sweep changes less than that.
         max_sweeps: bound on sweeps, each over normals and tangents.
+        buffers: memory for the rows.
     """
-    report = np.zeros((rows.stripe.size - 1, 3))
-    packed = _prepare(rows.normal, rows.body, rows.motion, rows.stripe, target, start, inertia)
+    m = len(rows.normal)
+    buffers = buffers or Buffers()
+    row, rub, before = buffers.array("row", (m, COLUMNS)), buffers.array("rub", (m, 2)), buffers.array("pre", (m, 3))
+    report = np.zeros((rows.stripe.size - 1, REPORTS))
+    body, motion, stripe = rows.body, rows.motion, rows.stripe
+    _prepare(rows.normal, body, motion, stripe, target, start, inertia, row, rub, before)
     sweeps = 0
     while True:
-        _sweep(packed, rows.body, rows.motion, rows.stripe, friction, inertia, report)
+        _sweep(row, rub, body, motion, stripe, friction, inertia, report)
         sweeps += 1
         if sweeps >= max_sweeps or report[:, CHANGE].max() <= tolerance:
-            _measure(packed, rows.body, rows.motion, rows.stripe, friction, inertia, report)
-            residual = float(report[:, RESIDUAL].max())
-            if sweeps >= max_sweeps or residual <= tolerance:
+            _measure(row, rub, before, body, motion, stripe, friction, inertia, report)
+            if sweeps >= max_sweeps or report[:, RESIDUAL].max() <= tolerance:
                 break
+    share = _share(report)
+    if share < 1.0:
+        _shorten(row, rub, body, motion, stripe, inertia, share)
+        _measure(row, rub, before, body, motion, stripe, friction, inertia, report)
     # One thread adds a fixed number of sums in order: the same bits on any number of threads.
-    work = float(report[:, WORK].sum())
-    return SpinningResult(packed[:, PUSH : RUB_2 + 1].copy(), sweeps, residual, work)
+    work = 0.5 * float(report[:, PUSH_BEFORE].sum() + report[:, PUSH_AFTER].sum())
+    impulse = np.column_stack([row[:, PUSH], rub])
+    return SpinningResult(impulse, sweeps, float(report[:, RESIDUAL].max()), work, share)
+
+
+def _share(report: Floats) -> float:
+    """Share of the impulses that gains no energy: 2 ΔK = α p·u_pre + α (p·u_pre + α p·Wp)."""
+    before, after = float(report[:, ALL_BEFORE].sum()), float(report[:, ALL_AFTER].sum())
+    return 1.0 if before + after <= 0.0 else max(-2.0 * before / (after - before), 0.0)
 
 
 @kernel
@@ -137,31 +160,29 @@ def _apply(
 
 
 @kernel
-def _approach(row: Floats, i: int, motion: Floats, a: int, b: int) -> float:
-    """Normal relative velocity."""
-    return float(
-        row[i, NORMAL] * (motion[b, 0] - motion[a, 0])
-        + row[i, NORMAL + 1] * (motion[b, 1] - motion[a, 1])
-        + row[i, NORMAL + 2] * (motion[b, 2] - motion[a, 2])
-    )
-
-
-@kernel
-def _slide(row: Floats, i: int, motion: Floats, a: int, b: int) -> tuple[float, float]:
-    """Sliding velocity along both tangents."""
+def _approach(row: Floats, i: int, motion: Floats, a: int, b: int) -> tuple[float, float, float]:
+    """Relative velocity along normal and tangents."""
     nx = row[i, NORMAL]
     ny = row[i, NORMAL + 1]
     nz = row[i, NORMAL + 2]
     tx = row[i, TANGENT]
     ty = row[i, TANGENT + 1]
+    # t₂ = n × t₁ with t₁ horizontal.
+    ox = -nz * ty
+    oy = nz * tx
+    oz = nx * ty - ny * tx
+    dx = motion[b, 0] - motion[a, 0]
+    dy = motion[b, 1] - motion[a, 1]
+    dz = motion[b, 2] - motion[a, 2]
     sx = motion[a, 4] + motion[b, 4]
     sy = motion[a, 5] + motion[b, 5]
     sz = motion[a, 6] + motion[b, 6]
-    # v_b - v_a, and the part of the surfaces: -(s × n).
-    dx = motion[b, 0] - motion[a, 0] - (sy * nz - sz * ny)
-    dy = motion[b, 1] - motion[a, 1] - (sz * nx - sx * nz)
-    dz = motion[b, 2] - motion[a, 2] - (sx * ny - sy * nx)
-    return tx * dx + ty * dy, -nz * ty * dx + nz * tx * dy + (nx * ty - ny * tx) * dz
+    # The surfaces add -(s × n): -s · t₂ along t₁, s · t₁ along t₂.
+    return (
+        nx * dx + ny * dy + nz * dz,
+        tx * dx + ty * dy - (sx * ox + sy * oy + sz * oz),
+        ox * dx + oy * dy + oz * dz + (sx * tx + sy * ty),
+    )
 
 
 @kernel
@@ -171,10 +192,10 @@ def _clamped(value: float, bound: float) -> float:
 
 @parallel_kernel
 def _prepare(
-    normal: Floats, body: Indices, motion: Floats, stripe: Ints, target: Floats, start: Floats, inertia: float
-) -> Floats:
+    normal: Floats, body: Indices, motion: Floats, stripe: Ints, target: Floats, start: Floats, inertia: float,
+    row: Floats, rub: Floats, before: Floats,
+) -> None:  # fmt: skip
     """Pack the contacts, and apply the first guess of their impulses."""
-    row = np.zeros((normal.shape[0], COLUMNS))
     for k in prange(stripe.size - 1):
         for i in range(stripe[k], stripe[k + 1]):
             nx = normal[i, 0]
@@ -191,83 +212,148 @@ def _prepare(
             row[i, FREEDOM] = 1.0 / (motion[a, 3] + motion[b, 3])
             row[i, TARGET] = target[i]
             row[i, PUSH] = start[i, 0]
-            row[i, RUB] = start[i, 1]
-            row[i, RUB_2] = start[i, 2]
-            row[i, BEFORE] = _approach(row, i, motion, a, b)
+            rub[i, 0] = start[i, 1]
+            rub[i, 1] = start[i, 2]
+            before[i, 0], before[i, 1], before[i, 2] = _approach(row, i, motion, a, b)
     for half in range(2):
         for k in prange((stripe.size - half) // 2):
             for i in range(stripe[2 * k + half], stripe[2 * k + half + 1]):
-                push, rub, rub_2 = row[i, PUSH], row[i, RUB], row[i, RUB_2]
-                _apply(row, i, motion, body[i, 0], body[i, 1], push, rub, rub_2, inertia)
-    return row
+                if row[i, PUSH] != 0.0 or rub[i, 0] != 0.0 or rub[i, 1] != 0.0:
+                    _apply(row, i, motion, body[i, 0], body[i, 1], row[i, PUSH], rub[i, 0], rub[i, 1], inertia)
 
 
 @kernel
 def _sweep_stripe(
-    row: Floats, body: Indices, motion: Floats, begin: int, end: int, friction: float, inertia: float
+    row: Floats, rub: Floats, body: Indices, motion: Floats, begin: int, end: int, friction: float, inertia: float
 ) -> float:
-    """One sweep over one stripe; returns the largest change of a relative velocity that it made."""
+    """One sweep over one stripe; returns the largest change of a relative velocity that it made.
+
+    All is written out, with every velocity read once: a call would cost as much as the work.
+    """
     change = 0.0
     slip = 1.0 / (1.0 + inertia)
     for i in range(begin, end):
         a = body[i, 0]
         b = body[i, 1]
+        nx = row[i, NORMAL]
+        ny = row[i, NORMAL + 1]
+        nz = row[i, NORMAL + 2]
+        vx_a, vy_a, vz_a = motion[a, 0], motion[a, 1], motion[a, 2]
+        vx_b, vy_b, vz_b = motion[b, 0], motion[b, 1], motion[b, 2]
+        dx = vx_b - vx_a
+        dy = vy_b - vy_a
+        dz = vz_b - vz_a
         freedom = row[i, FREEDOM]
         push = row[i, PUSH]
-        new_push = max(push - (_approach(row, i, motion, a, b) - row[i, TARGET]) * freedom, 0.0)
+        new_push = max(push - (nx * dx + ny * dy + nz * dz - row[i, TARGET]) * freedom, 0.0)
         # Neither normal nor friction impulse, as before: half of the contacts of a moving layer.
         if new_push == 0.0 and push == 0.0:
             continue
-        along, across = _slide(row, i, motion, a, b)
+        tx = row[i, TANGENT]
+        ty = row[i, TANGENT + 1]
+        # t₂ = n × t₁ with t₁ horizontal.
+        ox = -nz * ty
+        oy = nz * tx
+        oz = nx * ty - ny * tx
+        sx_a, sy_a, sz_a = motion[a, 4], motion[a, 5], motion[a, 6]
+        sx_b, sy_b, sz_b = motion[b, 4], motion[b, 5], motion[b, 6]
+        sx = sx_a + sx_b
+        sy = sy_a + sy_b
+        sz = sz_a + sz_b
+        along = tx * dx + ty * dy - (sx * ox + sy * oy + sz * oz)
+        across = ox * dx + oy * dy + oz * dz + (sx * tx + sy * ty)
         bound = friction * new_push
-        rub = row[i, RUB]
-        rub_2 = row[i, RUB_2]
-        new_rub = _clamped(rub - along * freedom * slip, bound)
-        new_rub_2 = _clamped(rub_2 - across * freedom * slip, bound)
+        rub_1 = rub[i, 0]
+        rub_2 = rub[i, 1]
+        new_rub_1 = min(max(rub_1 - along * freedom * slip, -bound), bound)
+        new_rub_2 = min(max(rub_2 - across * freedom * slip, -bound), bound)
         row[i, PUSH] = new_push
-        row[i, RUB] = new_rub
-        row[i, RUB_2] = new_rub_2
-        _apply(row, i, motion, a, b, new_push - push, new_rub - rub, new_rub_2 - rub_2, inertia)
-        jump = max(abs(new_push - push), max(abs(new_rub - rub), abs(new_rub_2 - rub_2)) * (1.0 + inertia))
-        jump *= motion[a, 3] + motion[b, 3]
+        rub[i, 0] = new_rub_1
+        rub[i, 1] = new_rub_2
+        # Q, and -κ n × Q with n × Q = λ₁ t₂ - λ₂ t₁.
+        p = new_push - push
+        p_1 = new_rub_1 - rub_1
+        p_2 = new_rub_2 - rub_2
+        qx = p * nx + p_1 * tx + p_2 * ox
+        qy = p * ny + p_1 * ty + p_2 * oy
+        qz = p * nz + p_2 * oz
+        ux = inertia * (p_2 * tx - p_1 * ox)
+        uy = inertia * (p_2 * ty - p_1 * oy)
+        uz = -inertia * p_1 * oz
+        w_a = motion[a, 3]
+        w_b = motion[b, 3]
+        # All stripes share the immovable body: threads that write to it would take its cache line from one another.
+        if w_a > 0.0:
+            motion[a, 0], motion[a, 1], motion[a, 2] = vx_a - w_a * qx, vy_a - w_a * qy, vz_a - w_a * qz
+            motion[a, 4], motion[a, 5], motion[a, 6] = sx_a + w_a * ux, sy_a + w_a * uy, sz_a + w_a * uz
+        motion[b, 0], motion[b, 1], motion[b, 2] = vx_b + w_b * qx, vy_b + w_b * qy, vz_b + w_b * qz
+        motion[b, 4], motion[b, 5], motion[b, 6] = sx_b + w_b * ux, sy_b + w_b * uy, sz_b + w_b * uz
+        jump = max(abs(p), max(abs(p_1), abs(p_2)) * (1.0 + inertia)) * (w_a + w_b)
         change = max(change, jump)
     return change
 
 
 @parallel_kernel
 def _sweep(
-    row: Floats, body: Indices, motion: Floats, stripe: Ints, friction: float, inertia: float, report: Floats
-) -> None:
+    row: Floats, rub: Floats, body: Indices, motion: Floats, stripe: Ints, friction: float, inertia: float,
+    report: Floats,
+) -> None:  # fmt: skip
     """One sweep over all contacts, the even stripes first."""
     for half in range(2):
         for k in prange((stripe.size - half) // 2):
             s = 2 * k + half
-            report[s, CHANGE] = _sweep_stripe(row, body, motion, stripe[s], stripe[s + 1], friction, inertia)
+            report[s, CHANGE] = _sweep_stripe(row, rub, body, motion, stripe[s], stripe[s + 1], friction, inertia)
 
 
 @parallel_kernel
 def _measure(
-    row: Floats, body: Indices, motion: Floats, stripe: Ints, friction: float, inertia: float, report: Floats
-) -> None:
-    """Natural map of normals and tangents, and the work of the normal impulses, per stripe."""
+    row: Floats, rub: Floats, before: Floats, body: Indices, motion: Floats, stripe: Ints, friction: float,
+    inertia: float, report: Floats,
+) -> None:  # fmt: skip
+    """Natural map of normals and tangents, and what the work of the impulses is made of, per stripe."""
     slip = 1.0 / (1.0 + inertia)
     for k in prange(stripe.size - 1):
         residual = 0.0
-        work = 0.0
+        push_before = push_after = all_before = all_after = 0.0
         for i in range(stripe[k], stripe[k + 1]):
-            u = _approach(row, i, motion, body[i, 0], body[i, 1])
-            along, across = _slide(row, i, motion, body[i, 0], body[i, 1])
+            u, along, across = _approach(row, i, motion, body[i, 0], body[i, 1])
             freedom = row[i, FREEDOM]
             push = row[i, PUSH]
             bound = friction * push
             residual = max(residual, abs(min(u - row[i, TARGET], push / freedom)))
-            rub = row[i, RUB]
-            rub_2 = row[i, RUB_2]
+            rub_1 = rub[i, 0]
+            rub_2 = rub[i, 1]
             sliding = max(
-                abs(_clamped(rub - along * freedom * slip, bound) - rub),
+                abs(_clamped(rub_1 - along * freedom * slip, bound) - rub_1),
                 abs(_clamped(rub_2 - across * freedom * slip, bound) - rub_2),
             )
             residual = max(residual, sliding * (1.0 + inertia) / freedom)
-            work += 0.5 * push * (row[i, BEFORE] + u)
+            push_before += push * before[i, 0]
+            push_after += push * u
+            all_before += push * before[i, 0] + rub_1 * before[i, 1] + rub_2 * before[i, 2]
+            all_after += push * u + rub_1 * along + rub_2 * across
         report[k, RESIDUAL] = residual
-        report[k, WORK] = work
+        report[k, PUSH_BEFORE] = push_before
+        report[k, PUSH_AFTER] = push_after
+        report[k, ALL_BEFORE] = all_before
+        report[k, ALL_AFTER] = all_after
+
+
+@parallel_kernel
+def _shorten(
+    row: Floats, rub: Floats, body: Indices, motion: Floats, stripe: Ints, inertia: float, share: float
+) -> None:
+    """Take back all of the impulses but a share."""
+    for half in range(2):
+        for k in prange((stripe.size - half) // 2):
+            for i in range(stripe[2 * k + half], stripe[2 * k + half + 1]):
+                push = row[i, PUSH]
+                rub_1 = rub[i, 0]
+                rub_2 = rub[i, 1]
+                row[i, PUSH] = share * push
+                rub[i, 0] = share * rub_1
+                rub[i, 1] = share * rub_2
+                _apply(
+                    row, i, motion, body[i, 0], body[i, 1],
+                    (share - 1.0) * push, (share - 1.0) * rub_1, (share - 1.0) * rub_2, inertia,
+                )  # fmt: skip

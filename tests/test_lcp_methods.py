@@ -152,8 +152,24 @@ def test_no_velocity_satisfies_contradicting_restitutions_and_nobody_says_that_o
     # Between two walls: v ≥ 1 from one contact, v ≤ 1/2 from the other.
     problem = ImpactProblem([1.0], [[1.0], [-1.0]], [-1.0], restitution=[1.0, 0.5])
     solution = method.solve(problem)
-    assert solution.status is not Status.CONVERGED
+    assert solution.status in (Status.STALLED, Status.ITERATION_LIMIT)
     assert np.isfinite(solution.v_post).all()
+
+
+def test_nonnegative_least_squares_says_stalled_where_no_velocity_satisfies_the_restitutions() -> None:
+    problem = ImpactProblem([1.0], [[1.0], [-1.0]], [-1.0], restitution=[1.0, 0.5])
+    assert NewtonLcpNnls().solve(problem).status is Status.STALLED
+
+
+@pytest.mark.parametrize("method", [NewtonLcpOsqp, NewtonLcpClarabel])
+def test_a_package_that_ends_above_our_tolerance_stalled_and_reached_no_bound(
+    method: type[NewtonLcpOsqp] | type[NewtonLcpClarabel],
+) -> None:
+    # Rounding alone leaves more than this.
+    problem = sphere_pack(spheres=100, start="hot").problem
+    solution = method(tolerance=1e-18).solve(problem)
+    assert solution.iterations < method().max_iterations
+    assert solution.status is Status.STALLED
 
 
 @every_method

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import numba
 import numpy as np
 import pytest
+import scipy.sparse as sp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -15,7 +17,7 @@ from solvers import SOLVERS, ImpactProblem, Status, qce_stream
 from solvers.qce_heap import solve_by_heap
 from solvers.quadratic_contact_energy import MOST_CONTACTS_OF_A_BODY, SMALL, solve_elastic
 from solvers.solution import Floats
-from solvers.sphere_rows import RENUMBERED, sphere_rows
+from solvers.sphere_rows import RENUMBERED, STRIPS, sphere_rows
 from tests.random_problems import KINDS, make, problems, reordered
 
 # Both evaluate the same equations; their rounding grows over tens to thousands of outer iterations.
@@ -26,7 +28,8 @@ TOLERANCE = 1e-10
 
 KERNELS = [name for name, function in vars(qce_stream).items() if hasattr(function, "py_func")]
 
-Streamed = Callable[..., tuple[Floats, int, int, int]]
+Parts = tuple[Floats, int, int, int]
+Streamed = Callable[..., Parts]
 
 
 def by_sparse_rows(problem: ImpactProblem, **settings: float) -> tuple[Floats, int, int, int]:
@@ -38,6 +41,14 @@ def by_sphere_rows(problem: ImpactProblem, **settings: float) -> tuple[Floats, i
     assert rows is not None
     impulse, iterations, visits, flag = qce_stream.solve_spheres(rows, **settings)  # type: ignore[arg-type]
     return rows.in_problem_order(impulse), iterations, visits, flag
+
+
+def in_strips(problem: ImpactProblem, strips: int, *, threshold: float, defer: float) -> Parts:
+    """As threads share it out, on one thread: the contacts of a chain, cut into strips of equal length."""
+    rows = sphere_rows(problem)
+    assert rows is not None
+    strip = (np.arange(strips + 1) * problem.m // strips).astype(np.int32)
+    return qce_stream._solve_spheres_alone(rows.normal, rows.body, rows.V, strip, threshold, defer, 10_000, 10**9)
 
 
 def check_against_heap(problem: ImpactProblem, *, defer: float = 0.0, max_iterations: int = 10_000) -> None:
@@ -89,6 +100,20 @@ def test_every_kernel_gives_the_heaps_answer(kind: str) -> None:
     check_against_heap(star(26, seed=0), max_iterations=1)
     # Few of its contacts approach: they are searched around what moved.
     check_against_heap(chain(60, np.concatenate([np.ones(2), np.zeros(58)])), max_iterations=5)
+
+
+@pytest.mark.kernels
+@pytest.mark.parametrize("defer", [0.0, 0.1])
+def test_strips_give_the_heaps_answer(defer: float) -> None:
+    balls = 41
+    problem = chain(balls, np.random.default_rng(5).normal(size=balls))
+    threshold = TOLERANCE * problem.speed
+    expected, iterations, _, _ = solve_by_heap(problem, threshold=threshold, defer=defer, max_iterations=10_000)
+    # Contacts i and i + 1 share a ball: even with strips of two contacts those of one parity share none.
+    for strips in (1, 3, 8, 20):
+        impulse, count, _, flag = in_strips(problem, strips, threshold=threshold, defer=defer)
+        np.testing.assert_allclose(impulse, expected, rtol=0, atol=SAME_ANSWER * expected.max())
+        assert (count, flag) == (iterations, 0)
 
 
 @given(problems, st.sampled_from([0.0, 0.1]))
@@ -243,6 +268,72 @@ def test_the_same_problem_gives_the_same_bits() -> None:
     first, second = (SOLVERS["qce"]().solve(problem) for _ in range(2))
     np.testing.assert_array_equal(first.v_post, second.v_post)
     assert (first.iterations, first.visits) == (second.iterations, second.visits)
+
+
+@pytest.mark.parametrize("start", ["kick", "hot"])
+def test_strips_and_threads_change_no_bit(start: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    problem = sphere_pack(spheres=3000, start=start).problem
+    options = {"threshold": TOLERANCE * problem.speed, "defer": 0.0, "max_iterations": 10_000}
+    together = by_sphere_rows(problem, **options)
+    monkeypatch.setattr(qce_stream, "SHARED_CONTACTS", 0)
+    rows = sphere_rows(problem)
+    assert rows is not None
+    assert rows.strip.size == STRIPS + 1
+    available = numba.get_num_threads()
+    answers = []
+    for threads in sorted({1, available}):
+        numba.set_num_threads(threads)
+        answers.append(by_sphere_rows(problem, **options))
+    numba.set_num_threads(available)
+    for answer in answers:
+        np.testing.assert_array_equal(answer[0], answers[0][0])
+        assert answer[1:] == answers[0][1:]
+        # Strips are another order of evaluation.
+        np.testing.assert_allclose(answer[0], together[0], rtol=0, atol=SAME_ANSWER * together[0].max())
+        assert answer[1] == together[1]
+
+
+def test_strips_of_one_parity_share_no_movable_body() -> None:
+    rows = sphere_rows(sphere_pack(spheres=3000, start="hot").problem)
+    assert rows is not None
+    for parity in range(2):
+        owner = np.full(rows.V.shape[0], -1)
+        for c in range(parity, STRIPS, 2):
+            bodies = np.unique(rows.body[rows.strip[c] : rows.strip[c + 1]])
+            bodies = bodies[rows.V[bodies, 3] > 0]
+            assert (owner[bodies] == -1).all()
+            owner[bodies] = c
+
+
+def test_contacts_that_cannot_be_cut_are_one_strip() -> None:
+    # A plate that all balls lie on is in every strip.
+    balls = 2 * RENUMBERED
+    rng = np.random.default_rng(2)
+    index = np.stack([np.arange(balls), np.full(balls, balls)], axis=1)
+    J = sp.csr_array((np.tile([1.0, -1.0], balls), index.ravel(), 2 * np.arange(balls + 1)), shape=(balls, balls + 1))
+    rows = sphere_rows(ImpactProblem(np.ones(balls + 1), J, rng.normal(size=balls + 1)))
+    assert rows is not None
+    np.testing.assert_array_equal(rows.strip, [0, balls])
+
+
+def test_a_problem_is_packed_once_and_no_solver_changes_what_it_keeps() -> None:
+    problem = sphere_pack(spheres=3000, start="kick").problem
+    still = problem.spheres_at_rest
+    assert still is not None
+    kept = [array.copy() for array in (still.normal, still.body, still.V, still.contact, still.owner, still.strip)]
+    laws = [SOLVERS["qce"](), SOLVERS["ehi"](), SOLVERS["gr"](max_iterations=3), SOLVERS["lcp-pgs"](max_iterations=3)]  # type: ignore[call-arg]
+    for law in laws:
+        law.solve(problem)
+    faster = problem.replace(v_pre=2.0 * problem.v_pre)
+    assert faster.spheres_at_rest is still
+    for before, after in zip(
+        kept, (still.normal, still.body, still.V, still.contact, still.owner, still.strip), strict=True
+    ):
+        np.testing.assert_array_equal(before, after)
+    twice, once = sphere_rows(faster), sphere_rows(problem)
+    assert twice is not None
+    assert once is not None
+    np.testing.assert_array_equal(twice.V[:, :3], 2.0 * once.V[:, :3])
 
 
 @pytest.mark.parametrize("kind", ["chain", "discs", "spheres"])

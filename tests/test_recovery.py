@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -16,7 +14,7 @@ from solvers.generalized_reflections import GeneralizedReflections
 from solvers.newton_lcp import NewtonLcp
 from solvers.pairwise import GaussSeidel
 from solvers.quadratic_contact_energy import QuadraticContactEnergy
-from solvers.recovery import TOLERANCE, Recovered, resolve
+from solvers.recovery import TOLERANCE, resolve
 from tests.random_problems import problems
 
 # Rounding of an energy that is a sum of up to a hundred squares, relative to it.
@@ -128,7 +126,7 @@ def test_a_converged_answer_is_returned_as_it_is() -> None:
     problem = CATALOG["newtons-cradle"]().problem
     solution = QuadraticContactEnergy().solve(problem)
     assert resolve(problem, solution) is solution
-    assert Recovered(QuadraticContactEnergy()).solve(problem).v_post.tobytes() == solution.v_post.tobytes()
+    assert QuadraticContactEnergy(recover_after=100).solve(problem).v_post.tobytes() == solution.v_post.tobytes()
 
 
 @pytest.mark.parametrize("status", [Status.NOT_FINITE, Status.UNSUPPORTED])
@@ -169,16 +167,14 @@ def test_friction_impulses_are_kept_and_stay_within_their_bounds() -> None:
 
 def test_without_elastic_iterations_recovery_is_the_inelastic_impact() -> None:
     problem = CATALOG["sphere-pack"](spheres=100).problem
-    recovered = Recovered(QuadraticContactEnergy(max_iterations=0)).solve(problem)
+    recovered = resolve(problem, QuadraticContactEnergy(max_iterations=0).solve(problem))
     inelastic = NewtonLcp().solve(problem.replace(restitution=0.0))
     # Velocities of the inelastic LCP are unique; both solves stop at a residual of 1e-11 or below.
     np.testing.assert_allclose(recovered.v_post, inelastic.v_post, atol=1e-8)
 
 
-def test_recovered_laws_are_settings_that_compare_and_refuse_as_the_law_does() -> None:
-    law = Recovered(QuadraticContactEnergy(max_iterations=100))
-    assert law == replace(law)
-    assert hash(law) == hash(Recovered(QuadraticContactEnergy(max_iterations=100)))
+def test_a_recovered_law_refuses_as_the_law_does() -> None:
+    law = QuadraticContactEnergy(recover_after=100)
     with pytest.raises(UnsupportedProblem, match="restitution must be 1"):
         law.solve(CATALOG["newtons-cradle"](restitution=0.5).problem)
 
@@ -189,7 +185,8 @@ def test_recovery_is_off_unless_it_is_asked_for() -> None:
     assert plain.status is Status.ITERATION_LIMIT
     assert approach(problem, plain) == pytest.approx(1.0)
     # Elastic: the ball goes to and fro and keeps its energy; recovered, it stops.
-    assert Recovered(QuadraticContactEnergy(max_iterations=25)).solve(problem).v_post == pytest.approx([0.0], abs=1e-12)
+    recovered = QuadraticContactEnergy(recover_after=25).solve(problem)
+    assert recovered.v_post == pytest.approx([0.0], abs=1e-12)
 
 
 @every_jammed_scene
