@@ -4,9 +4,9 @@
 
 An absolute tolerance would pass an energy error that grew from 2e-9 to 1e-8; a factor of five is a factor of five here.
 Below the floor (eps the spacing of float64 at 1, m the contacts of the scene) everything is rounding. Gated are the
-single impacts of one tier: energy, momentum, one-sidedness, residuals, termination, and counted work. They are
-deterministic up to rounding, so that a baseline of another machine holds as well; it is named in the report. Wall time
-is in no baseline: `harness.revision` compares it with another commit within one job.
+single impacts of one tier: energy, momentum, one-sidedness, symmetry, residuals, termination, and counted work. They
+are deterministic up to rounding, so that a baseline of another machine holds as well; it is named in the report. Wall
+time is in no baseline: `harness.revision` compares it with another commit within one job.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from harness.desiderata import SYMMETRY_TOLERANCE
 from harness.environment import describe_environment
 from harness.files import replace_file
 from harness.measurement import Kind, Outcome, Verdict
@@ -57,8 +58,13 @@ _METRICS = {
     ("MOM", "worst momentum drift"): "momentum drift",
     ("ONE", "pulling impulse"): "pulling impulse",
     ("ONE", "remaining approach"): "remaining approach",
+    ("SYM", "worst symmetry residual"): "symmetry residual",
+    ("SYM", "worst renumbering residual"): "renumbering residual",
     ("termination", "stopping test missed"): "stopping test missed",
 }
+# How many images of a scene are tried depends on the work of a solve, and each is solved to a tolerance: what is within
+# the bound of SYM says nothing of a trend.
+_FLOORS = dict.fromkeys(("symmetry residual", "renumbering residual"), SYMMETRY_TOLERANCE)
 METRICS = (*_METRICS.values(), WORK)
 """What is gated, beside every metric that begins with RESIDUAL."""
 
@@ -440,7 +446,9 @@ def _compare_pair(pair: Pair, accepted: Entry, now: Entry | None) -> list[Differ
 
 def _compare_number(pair: Pair, metric: str, accepted: Entry, now: Entry) -> Difference:
     """One number beside the accepted one."""
-    floor, allowance = (0.0, WORK_ALLOWANCE) if metric == WORK else (rounding_floor(now.contacts), ERROR_ALLOWANCE)
+    floor, allowance = _FLOORS.get(metric, rounding_floor(now.contacts)), ERROR_ALLOWANCE
+    if metric == WORK:
+        floor, allowance = 0.0, WORK_ALLOWANCE
     old, new = accepted.values.get(metric, math.nan), now.values.get(metric, math.nan)
     if metric not in now.values:
         note = "the number is not there any more"

@@ -94,7 +94,7 @@ def time_against(
     Raises:
         RevisionError: there is no repository or commit, it does not start, or nothing can be timed in both trees.
     """
-    top, commit = _repository(), _commit(revision)
+    top, commit = _repository(), find_commit(revision)
     with tempfile.TemporaryDirectory(prefix="impactbench-revision-") as folder:
         _unpack(commit, Path(folder))
         on_progress(f"compiling {commit[:12]} and this tree")
@@ -245,9 +245,14 @@ def _repository() -> Path:
     return Path(_git("rev-parse", "--show-toplevel").decode().strip()).resolve()
 
 
-def _commit(revision: str) -> str:
-    """Full name of a commit; a leading dash would be an option of git."""
+def find_commit(revision: str) -> str:
+    """Full name of a commit of the repository around the current folder.
+
+    Raises:
+        RevisionError: there is no such repository or commit.
+    """
     try:
+        # A leading dash would be an option of git.
         return _git("rev-parse", "--verify", "--quiet", "--end-of-options", f"{revision}^{{commit}}").decode().strip()
     except RevisionError:
         raise RevisionError(

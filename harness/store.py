@@ -465,7 +465,7 @@ def _differences(path: Path, stored: Mapping[str, object], now: Mapping[str, obj
 
 def _damaged(path: Path, symptom: str) -> str:
     return (
-        f"{path} is damaged or not a results file ({symptom}). It was left as it is. "
+        f"{path} is damaged or not a results file ({' '.join(symptom.split())}). It was left as it is. "
         "--fresh sets it aside and starts anew; a copy may be readable with `sqlite3 … .recover`"
     )
 

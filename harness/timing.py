@@ -31,7 +31,7 @@ from solvers.solution import Floats
 # A sample is as many solves as take this long, so that the clock's own error and call (0.3 µs) do not show [s].
 SAMPLE_S = 0.005
 MOST_SOLVES = 200
-# Samples of one task. A solve that takes longer than LONG_S is sampled once: its own length averages the machine.
+# Samples of one task. A solve that takes longer than LONG_S is timed once: its own length averages the machine.
 SAMPLES = 3
 LONG_S = 0.2
 # The calibration kernel may be this much slower than its best time of the whole run before a timing is flagged: quiet
@@ -82,10 +82,11 @@ def time_solver(solver: Solver, problem: ImpactProblem, *, samples: int = SAMPLE
     fresh_problem = unbuilt(problem)
     with _quiet():
         memory_bytes, fresh_s, solution = _fresh(solver, fresh_problem)
-        _, warm_s, _ = _clocked(lambda: solver.solve(fresh_problem))
-        solves = int(np.clip(np.ceil(SAMPLE_S / max(warm_s, 1e-9)), 1, MOST_SOLVES))
-        count = 1 if warm_s > LONG_S else samples
-        taken = [_sample(solver, fresh_problem, solves) for _ in range(count)]
+        solves, taken = 1, [_sample(solver, fresh_problem, 1)]
+        warm_s = taken[0][0]
+        if warm_s <= LONG_S:
+            solves = int(np.clip(np.ceil(SAMPLE_S / max(warm_s, 1e-9)), 1, MOST_SOLVES))
+            taken = [_sample(solver, fresh_problem, solves) for _ in range(samples)]
     return Timing(
         cpu_s=tuple(cpu for cpu, _ in taken),
         wall_s=tuple(wall for _, wall in taken),

@@ -125,8 +125,9 @@ DIALS: dict[str, tuple[Dial, ...]] = {
     "hertz": _COMPLIANT,
     "jacobi": (Dial({"max_iterations": 1.0}, PASSES),),
     "lcp-apgd": (_FINE_TOLERANCE,),
-    "lcp-clarabel": (_TOLERANCE,),
-    "lcp-osqp": (_TOLERANCE,),
+    # `tolerance` judges what comes back: how long a package works is said by its own.
+    "lcp-clarabel": (Dial({"solver_tolerance": 1.0}, FINE_TOLERANCES),),
+    "lcp-osqp": (Dial({"solver_tolerance": 1.0}, TOLERANCES),),
     "lcp-pgs": (_FINE_TOLERANCE,),
     "lcp-spg": (_FINE_TOLERANCE,),
     "lzb": _COMPLIANT,
@@ -378,8 +379,9 @@ def _seeded(name: str, parameters: Mapping[str, object], seed: int) -> Mapping[s
 
 def _points(choice: SolverChoice, contacts: int) -> list[_Point]:
     """A solver at all settings of its dial that does something with so many contacts."""
-    default = Dial({"tolerance": 1.0}, TOLERANCES)
-    swept = DIALS.get(choice.name, (default,) if "tolerance" in choice.settings and choice.name not in _EXACT else ())
+    swept = DIALS.get(
+        choice.name, (_TOLERANCE,) if "tolerance" in choice.settings and choice.name not in _EXACT else ()
+    )
     for dial in swept:
         given = choice.specification.removeprefix(choice.name)
         fields = setting_fields(type(choice.solver))

@@ -9,8 +9,6 @@ bench_profiles.csv   performance profiles with their bootstrap bands
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 import os
 from collections.abc import Iterable, Sequence
@@ -23,7 +21,7 @@ from harness.results import Frames
 from harness.statistics import LEVEL, bootstrap_band, compare_costs, performance_profile
 from harness.timing import NOISE_RATIO, is_noisy
 from harness.work_precision import APPROACH, ENERGY, MOMENTUM, OWN_EQUATIONS, OWN_LIMIT, VERIFICATION
-from reports.bench_figures import write_bench_figures
+from reports.bench_figures import LCP_LOOKS, write_bench_figures
 from reports.bench_rows import (
     COMPARED_AT,
     FIT_FROM,
@@ -42,7 +40,8 @@ from reports.bench_rows import (
 )
 from reports.files import prepare, write_whole
 from reports.markdown import markdown_table
-from reports.wording import number
+from reports.spreadsheet import csv_text
+from reports.wording import count_text, number, time_text
 
 # Zhang 2015, Section 5.3: average time of frictional contact resolution in the pattern "Hex", 60,000 grains.
 PAPER_QCE_S, PAPER_GR_S = 0.25, 6.1
@@ -73,10 +72,10 @@ def write_bench(store: Frames, folder: str | os.PathLike[str]) -> list[Path]:
     path = prepare(folder)
     texts = {
         "bench.md": bench_markdown(bench),
-        "bench_points.csv": _as_csv(_point_rows(bench)),
-        "bench_reach.csv": _as_csv(_reach_rows(bench)),
-        "bench_scaling.csv": _as_csv(_scaling_rows(bench)),
-        "bench_profiles.csv": _as_csv(_profile_rows(bench)),
+        "bench_points.csv": csv_text(_point_rows(bench)),
+        "bench_reach.csv": csv_text(_reach_rows(bench)),
+        "bench_scaling.csv": csv_text(_scaling_rows(bench)),
+        "bench_profiles.csv": csv_text(_profile_rows(bench)),
     }
     written = [write_whole(path / name, text.encode()) for name, text in texts.items()]
     return [*written, *write_bench_figures(bench, path)]
@@ -128,7 +127,7 @@ def _noise(bench: Bench) -> list[str]:
     verdict = "**NOISY MACHINE**" if noisy * 10 > times.size else "quiet"
     return [
         f"Calibration kernel: {verdict}. {noisy} of {times.size} runs took more than {NOISE_RATIO:g} times the best "
-        f"({_seconds(best)}); median {np.median(times) / best:.2f}, worst {times.max() / best:.2f} times the best. "
+        f"({time_text(best)}); median {np.median(times) / best:.2f}, worst {times.max() / best:.2f} times the best. "
         "Where it is noisy, compare minima and contact visits, not medians."
     ]
 
@@ -166,7 +165,7 @@ def _pair(scene: str, qce: Point, gr: Point) -> tuple[str, ...]:
         rounds = [gr.timed.rounds[k] / qce.timed.rounds[k] for k in qce.timed.rounds if k in gr.timed.rounds]
         span = f"{min(rounds):.2f} … {max(rounds):.2f}" if rounds else "–"
     visits = f"{gr.work / qce.work:.2f}" if math.isfinite(gr.work) and math.isfinite(qce.work) else "–"
-    return scene, f"{qce.contacts:,}", _time_text(qce), _time_text(gr), ratio, span, visits
+    return scene, f"{qce.contacts:,}", _median_text(qce), _median_text(gr), ratio, span, visits
 
 
 def _reach_section(bench: Bench) -> list[str]:
@@ -208,7 +207,7 @@ def _reach_cells(points: Sequence[Point], metric: str, targets: Sequence[float])
             continue
         cheapest = min((p for p in points if math.isfinite(p.work)), key=lambda p: p.work)
         bound = "≤ " if cheapest.error(metric) <= target else ""
-        cells.append(f"{bound}{_seconds(float(time))} ({_count(float(work))})")
+        cells.append(f"{bound}{time_text(float(time))} ({count_text(float(work))})")
     return cells
 
 
@@ -303,7 +302,7 @@ def _scaling_section(bench: Bench) -> list[str]:
             fit = exponent(p for p in bench.scaling if p.law == law and p.family == family)
             cells.append("–" if fit is None else f"{fit.exponent:.2f}{_interval(fit.low, fit.high)} (n={fit.points})")
         body.append((law, *cells))
-    lines += [*markdown_table(("law", *families), body), ""]
+    lines += [*markdown_table(("law", *families), body), "", *_unfinished(bench.scaling)]
     heading = (
         "law",
         "contacts",
@@ -328,6 +327,39 @@ def _scaling_section(bench: Bench) -> list[str]:
     ]
 
 
+def _unfinished(points: Sequence[Point]) -> list[str]:
+    """Say in words who did not meet its own test at which sizes, and who solves the same equations there."""
+    sentences = []
+    for family in dict.fromkeys(point.family for point in points):
+        here = [point for point in points if point.family == family]
+        for law in laws(here):
+            missed = [point for point in here if point.law == law and point.timed and not point.converged]
+            if not missed:
+                continue
+            where = ", ".join(f"{point.contacts:,} contacts ({point.status})" for point in missed)
+            sentences.append(f"- `{law}` on {family}: {where}.{_peers(law, missed[-1], here)}")
+    if not sentences:
+        return []
+    return [
+        "Not converged: here a law's own test did not pass at its default settings. The times below are then until "
+        "it gave up, not of an answer to its tolerance, and no exponent is fitted to them; what it reaches in which "
+        "time is in the tables of the cost to reach an error.",
+        "",
+        *sentences,
+        "",
+    ]
+
+
+def _peers(law: str, missed: Point, points: Sequence[Point]) -> str:
+    """Methods for the Newton LCP that converged where another of them did not; empty for all other laws."""
+    here = [p for p in points if p.law.partition(":")[0] in LCP_LOOKS and p.contacts == missed.contacts]
+    if law not in laws(here):
+        return ""
+    able = [point.law for point in here if point.converged]
+    at = f"at {missed.contacts:,} contacts"
+    return f" The same equations are solved {at} by {', '.join(able)}." if able else f" No method solved them {at}."
+
+
 def _size_row(point: Point) -> tuple[str, ...]:
     """One size of one law."""
     timed = point.timed
@@ -338,9 +370,9 @@ def _size_row(point: Point) -> tuple[str, ...]:
     if point.contacts >= MEASURABLE_FROM and not math.isnan(growth):
         memory += f", {timed.memory_bytes / point.contacts:.0f} B a contact"
     return (
-        point.law, f"{point.contacts:,}", _seconds(timed.repeats.median), _seconds(timed.repeats.minimum),
-        f"{timed.repeats.spread:.0%}", f"{timed.noisy}/{len(timed.rounds)}", _seconds(timed.fresh_s),
-        _count(point.work), memory, _ended(point),
+        point.law, f"{point.contacts:,}", time_text(timed.repeats.median), time_text(timed.repeats.minimum),
+        f"{timed.repeats.spread:.0%}", f"{timed.noisy}/{len(timed.rounds)}", time_text(timed.fresh_s),
+        count_text(point.work), memory, _ended(point),
     )  # fmt: skip
 
 
@@ -349,7 +381,7 @@ def _cold_section(bench: Bench) -> list[str]:
     if not bench.first_solves:
         return []
     body = [
-        (first.law, _seconds(first.first.median), _seconds(first.second.median), str(first.first.count))
+        (first.law, time_text(first.first.median), time_text(first.second.median), str(first.first.count))
         for first in bench.first_solves
     ]
     return [
@@ -368,9 +400,9 @@ def _warm_section(bench: Bench) -> list[str]:
         return []
     body = [
         (
-            steps.law, steps.scene, str(steps.steps), _seconds(steps.cold.median), _seconds(steps.warm.median),
+            steps.law, steps.scene, str(steps.steps), time_text(steps.cold.median), time_text(steps.warm.median),
             f"{steps.cold.median / steps.warm.median:.2f}" if steps.warm.median > 0 else "–",
-            f"{_count(steps.cold_visits)} → {_count(steps.warm_visits)}", number(steps.difference),
+            f"{count_text(steps.cold_visits)} → {count_text(steps.warm_visits)}", number(steps.difference),
             ", ".join(steps.statuses),
         )
         for steps in bench.warm_steps
@@ -474,21 +506,6 @@ def _profile_rows(bench: Bench) -> Iterable[Sequence[object]]:
                 yield title, law, f"{factor:.6g}", share[t, k], low[t, k], high[t, k]
 
 
-def _as_csv(rows: Iterable[Sequence[object]]) -> str:
-    """Rows as CSV; numbers in full, missing ones empty."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    for row in rows:
-        writer.writerow([_cell(entry) for entry in row])
-    return text.getvalue()
-
-
-def _cell(entry: object) -> object:
-    if isinstance(entry, (float, np.floating)):
-        return "" if math.isnan(entry) else repr(float(entry))
-    return "" if entry is None else entry
-
-
 def _ended(point: Point) -> str:
     """How a point ended: the solver's status, or the outcome of a task without an answer."""
     if point.outcome is None:
@@ -496,30 +513,9 @@ def _ended(point: Point) -> str:
     return point.status if point.outcome is Outcome.MEASURED else point.outcome.value
 
 
-def _time_text(point: Point) -> str:
-    return _seconds(point.median_s) if point.timed else _ended(point)
+def _median_text(point: Point) -> str:
+    return time_text(point.median_s) if point.timed else _ended(point)
 
 
 def _interval(low: float, high: float) -> str:
     return "" if math.isnan(low) else f" [{low:.2f}, {high:.2f}]"
-
-
-def _seconds(time: float) -> str:
-    """A time with its unit, three figures."""
-    if not math.isfinite(time):
-        return "–"
-    for unit, factor in (("s", 1.0), ("ms", 1e3), ("µs", 1e6)):
-        if time * factor >= 1.0:
-            return f"{time * factor:.3g} {unit}"
-    return f"{time * 1e9:.3g} ns"
-
-
-def _count(count: float) -> str:
-    """A count, thousands and millions shortened."""
-    if not math.isfinite(count):
-        return "–"
-    for unit, factor in (("G", 1e9), ("M", 1e6), ("k", 1e3)):
-        # Up to 9,999 as it is.
-        if count >= max(factor, 1e4):
-            return f"{count / factor:.4g} {unit}"
-    return f"{count:.0f}"

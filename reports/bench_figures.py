@@ -62,7 +62,10 @@ BENCH_LOOKS: Mapping[str, Look] = {
     "gauss-seidel": Look("Gauss-Seidel", GRAY, "<", (0, (4, 1.2, 1, 1.2)), filled=False, size=4.2),
     "jacobi": Look("Jacobi", GRAY, ">", (0, (1, 1.2)), filled=False, size=4.2),
 }
-"""Laws that differ in their answers, in drawing order; at c_r = 1 `qce-lcp` and `qce-blend` are `qce`."""
+"""Laws of the registry that differ in their answers, in drawing order."""
+
+SAME_AS_QCE = ("qce-lcp", "qce-blend")
+"""At c_r = 1, as in all scenes of the bench, these are `qce`: they are in the tables."""
 
 LCP_LOOKS: Mapping[str, Look] = {
     "lcp-pgs": Look("projected Gauss-Seidel", ORANGE, "^", (0, (4, 1.2, 1, 1.2))),
@@ -72,7 +75,12 @@ LCP_LOOKS: Mapping[str, Look] = {
     "lcp-clarabel": Look("Clarabel", VERMILLION, "o", "-", filled=False, size=4.6),
     "lcp-nnls": Look("NNLS (active set)", GREEN, "*", "-", size=6.0),
 }
-"""Methods for one and the same law, the Newton LCP."""
+"""Methods for one and the same law, the Newton LCP; `lcp-pgs` stands for it among the laws."""
+
+OTHERS: Sequence[tuple[str, str, Any]] = (
+    (GREEN, "X", "-"), (BLUE, "d", (0, (6, 1.5))), (PURPLE, "h", (0, (4, 2))), (ORANGE, "*", (0, (1, 1.2))),
+)  # fmt: skip
+"""Color, marker and line of laws that the user brings, in turn."""
 
 # Errors below rounding are drawn on this line: a logarithm has no zero.
 FLOOR = 1e-17
@@ -112,7 +120,7 @@ def figures(bench: Bench) -> dict[str, Callable[[], Figure]]:
     found: dict[str, Callable[[], Figure]] = {}
     for k, scene in enumerate(scenes(bench.points), start=1):
         here = [point for point in bench.points if point.scene == scene and point.timed]
-        if _known(here, BENCH_LOOKS):
+        if _looks(here):
             found[f"bench_precision_{k}"] = lambda here=here: draw_precision(here)  # type: ignore[misc]
         if len(_known(here, LCP_LOOKS)) > 1:
             found[f"bench_lcp_{k}"] = lambda here=here: draw_lcp_methods(here)  # type: ignore[misc]
@@ -127,13 +135,14 @@ def draw_precision(points: Sequence[Point]) -> Figure:
     """One scene: errors of both kinds over time and over visits, one line a law."""
     figure = Figure(figsize=(TWO_COLUMNS, 4.6), layout="constrained")
     panels = figure.subplots(2, 2, sharex="col", sharey="row")
+    looks = _looks(points)
     reference = validation_metric(points)
     titles = ("(a) ", "(b) ", "(c) ", "(d) ")
     for row, metric in enumerate((VERIFICATION, reference)):
         for column, cost in enumerate((_time, _visits)):
             panel = panels[row, column]
             shown = [point for point in points if not is_own_reference(point.law, metric)]
-            _sweeps(panel, shown, BENCH_LOOKS, metric, cost)
+            _sweeps(panel, shown, looks, metric, cost)
             name = "own equations and approach" if row == 0 else f"against {reference.removeprefix('validation: ')}"
             panel.set_title(
                 titles[2 * row + column] + ("verification: " if row == 0 else "validation: ") + name, loc="left"
@@ -144,7 +153,7 @@ def draw_precision(points: Sequence[Point]) -> Figure:
     panels[1, 0].set_xlabel("CPU time of one solve [s]")
     panels[1, 1].set_xlabel("contact visits [–]")
     figure.suptitle(points[0].scene, fontsize=8)
-    _legend(figure, _known(points, BENCH_LOOKS), BENCH_LOOKS, columns=5)
+    _legend(figure, looks, columns=5)
     return figure
 
 
@@ -159,7 +168,7 @@ def draw_lcp_methods(points: Sequence[Point]) -> Figure:
         panel.set_xlabel(label)
     panels[0].set_ylabel("natural-map residual [–]")
     figure.suptitle(points[0].scene, fontsize=8)
-    _legend(figure, _known(points, LCP_LOOKS), LCP_LOOKS, columns=3)
+    _legend(figure, {law: LCP_LOOKS[law] for law in _known(points, LCP_LOOKS)}, columns=3)
     return figure
 
 
@@ -167,13 +176,14 @@ def draw_scaling(points: Sequence[Point]) -> Figure:
     """CPU time over contacts, one panel a family, with the fitted exponents in the legend."""
     # An interrupted bench has families without any time yet.
     families = list(dict.fromkeys(point.family for point in points if point.timed))
-    entries = len(_known(points, BENCH_LOOKS)) + 2
+    looks = _looks(points)
+    entries = len(looks) + 2
     figure = Figure(figsize=(TWO_COLUMNS, 2.7 + LEGEND_LINE * entries), layout="constrained")
     panels = np.atleast_1d(figure.subplots(1, len(families), sharey=True))
     for panel, family, letter in zip(panels, families, "abcdefgh", strict=False):
-        for law in _known(points, BENCH_LOOKS):
+        for law, look in looks.items():
             here = sorted((p for p in points if p.law == law and p.family == family), key=lambda p: p.contacts)
-            _growth(panel, here, BENCH_LOOKS[law])
+            _growth(panel, here, look)
         _slope_of_one(panel, [p for p in points if p.family == family and p.timed])
         panel.set_xscale("log")
         panel.set_yscale("log")
@@ -193,6 +203,8 @@ def draw_profiles(bench: Bench) -> Figure:
     factors = np.geomspace(1.0, LARGEST_FACTOR, 400)
     budgets = np.geomspace(1.0, LARGEST_BUDGET, 400)
     contacts = {point.scene: float(max(point.contacts, 1)) for point in bench.points}
+    looks = _looks(bench.points)
+    places = {law: place / len(looks) for place, law in enumerate(looks)}
     names: list[str] = []
     for column, (panel, visits) in enumerate(zip(panels, (False, True, True), strict=True)):
         where, names, costs = cost_matrix(bench, visits=visits)
@@ -201,8 +213,8 @@ def draw_profiles(bench: Bench) -> Figure:
         else:
             shares, x = data_profile(costs, [contacts[scene] for scene in where], budgets), budgets
         for k, law in enumerate(names):
-            if law in BENCH_LOOKS:
-                _steps(panel, x, shares[:, k], BENCH_LOOKS[law], place=list(BENCH_LOOKS).index(law) / len(BENCH_LOOKS))
+            if law in looks:
+                _steps(panel, x, shares[:, k], looks[law], place=places[law])
         panel.set_xscale("log")
         panel.set_ylim(-0.03, 1.03)
     panels[0].set_ylabel(rf"share of scenes, residual $\leq 10^{{{math.log10(COMPARED_AT):.0f}}}$ [–]")
@@ -213,7 +225,7 @@ def draw_profiles(bench: Bench) -> Figure:
         panels, ("(a) performance, time", "(b) performance, visits", "(c) data profile"), strict=True
     ):
         panel.set_title(title, loc="left")
-    _legend(figure, [law for law in BENCH_LOOKS if law in names], BENCH_LOOKS, columns=5)
+    _legend(figure, {law: look for law, look in looks.items() if law in names}, columns=5)
     return figure
 
 
@@ -223,6 +235,17 @@ def _time(point: Point) -> float:
 
 def _visits(point: Point) -> float:
     return point.work
+
+
+def _looks(points: Sequence[Point]) -> dict[str, Look]:
+    """Laws that differ in their answers with their looks: those of the registry, then what the user brought."""
+    known = {law: BENCH_LOOKS[law] for law in _known(points, BENCH_LOOKS)}
+    brought = [law for law in laws(points) if law not in {*BENCH_LOOKS, *LCP_LOOKS, *SAME_AS_QCE}]
+    for k, law in enumerate(brought):
+        color, marker, line = OTHERS[k % len(OTHERS)]
+        # A law from a file is named by the file and the class, without the folder.
+        known[law] = Look(law.rpartition("/")[2], color, marker, line, size=4.6)
+    return known
 
 
 def _known(points: Sequence[Point], looks: Mapping[str, Look]) -> list[str]:
@@ -317,12 +340,10 @@ def _steps(panel: Axes, x: Any, share: Any, look: Look, *, place: float) -> None
     )  # fmt: skip
 
 
-def _legend(figure: Figure, names: Sequence[str], looks: Mapping[str, Look], *, columns: int) -> None:
+def _legend(figure: Figure, looks: Mapping[str, Look], *, columns: int) -> None:
     """One legend for all panels, under them."""
     handles = [
-        Line2D(
-            [], [], color=looks[law].color, linestyle=looks[law].line, label=looks[law].label, **marker_of(looks[law])
-        )
-        for law in names
+        Line2D([], [], color=look.color, linestyle=look.line, label=look.label, **marker_of(look))
+        for look in looks.values()
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=columns, handlelength=3.2, columnspacing=1.4)

@@ -127,6 +127,11 @@ class WarmSteps:
     statuses: tuple[str, ...]
 
 
+def holds_bench(store: Frames) -> bool:
+    """Tell whether a store has the rows of a bench."""
+    return bool(store.frame("tasks")["scenario"].isin(RUNS).any())
+
+
 class Bench:
     """All rows of a bench.
 

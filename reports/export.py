@@ -11,6 +11,7 @@ from typing import Any
 
 import pandas as pd
 
+from reports.files import write_whole
 from reports.scorecard import ReportError
 
 
@@ -26,14 +27,14 @@ def as_json(frame: pd.DataFrame) -> str:
 
 
 def write_parquet(frame: pd.DataFrame, to: Path) -> None:
-    """Write a table as Parquet; structured cells as JSON text.
+    """Write a table as Parquet, whole or not at all; structured cells as JSON text.
 
     Raises:
-        ReportError: pyarrow is not installed.
+        ReportError: pyarrow is not installed, or the file cannot be written.
     """
     if importlib.util.find_spec("pyarrow") is None:
         raise ReportError("Parquet needs pyarrow: pip install pyarrow, or choose --format csv")
-    _flat(frame).to_parquet(to, index=False)
+    write_whole(to, _flat(frame).to_parquet(None, index=False))
 
 
 def _flat(frame: pd.DataFrame) -> pd.DataFrame:

@@ -12,7 +12,7 @@ from rich.text import Text
 from harness.baseline import WORK, Change, Comparison, Difference
 from harness.revision import TIME_ALLOWANCE, TimeComparison, TimeRatio
 from reports.markdown import markdown_table
-from reports.wording import number, one_line
+from reports.wording import number, one_line, time_text
 
 SHOWN_BETTER = 10
 """Numbers that got better, as many as are shown; all are counted."""
@@ -66,13 +66,14 @@ def gate_markdown(comparison: Comparison, times: TimeComparison | None = None) -
 def verdict(comparison: Comparison) -> str:
     """The comparison in one sentence."""
     worse, missing = comparison.of(Change.WORSE), comparison.of(Change.MISSING)
+    compared = len(comparison.differences) - len(comparison.of(Change.NEW))
     if not worse and not missing:
-        return f"Nothing got worse: {len(comparison.differences)} numbers compared"
+        return f"Nothing got worse: {compared} numbers compared"
     parts = []
     if worse:
         largest = max(worse, key=lambda difference: difference.change)
         where = f"{largest.metric}, {largest.solver} on {largest.scene}: {change_text(largest)}"
-        parts.append(f"{len(worse)} of {len(comparison.differences)} numbers got worse, most of all {where}")
+        parts.append(f"{len(worse)} of {compared} numbers got worse, most of all {where}")
     if missing:
         parts.append(f"{len(missing)} missing")
     return "; ".join(parts)
@@ -148,19 +149,13 @@ def _time_title(times: TimeComparison) -> str:
 
 def _time_row(row: TimeRatio) -> tuple[str, ...]:
     return (
-        row.solver, row.scene, _seconds(row.now_s), _seconds(row.before_s), f"× {row.median:.2f}",
+        row.solver, row.scene, time_text(row.now_s), time_text(row.before_s), f"× {row.median:.2f}",
         f"{row.lower:.2f} … {row.upper:.2f}", f"× {TIME_ALLOWANCE:g}",
     )  # fmt: skip
 
 
 def _time_notes(times: TimeComparison) -> Sequence[str]:
     return [f"not timed: {line}" for line in times.skipped]
-
-
-def _seconds(time_s: float) -> str:
-    """A time with its unit."""
-    unit, factor = next(((u, f) for u, f in (("s", 1.0), ("ms", 1e3)) if time_s * f >= 1.0), ("µs", 1e6))
-    return f"{time_s * factor:.3g} {unit}"
 
 
 def _table(title: str, heading: Sequence[str], rows: Iterable[Sequence[str]], style: str) -> Table:

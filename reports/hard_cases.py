@@ -6,8 +6,6 @@ the same bytes; a case that was not measured shows as not done, never as passed.
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 import os
 from collections import Counter
@@ -26,6 +24,7 @@ from harness.measurement import Kind
 from harness.results import Frames, Results, ScoreRow, TaskRow
 from reports.files import prepare, write_whole
 from reports.markdown import markdown_table
+from reports.spreadsheet import csv_text
 from reports.wording import number, one_line
 from scenarios.tiers import HARD_CASES
 
@@ -215,23 +214,20 @@ def hard_cases_markdown(table: HardTable) -> str:
 
 def hard_cases_csv(table: HardTable) -> str:
     """One line for each solver and case."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow((
+    rows: list[Sequence[object]] = [(
         "chapter", "scene", "solver", "conduct", "natural", "reason", "status", "iterations", "visits", "margin",
         "interior", "task",
-    ))  # fmt: skip
+    )]  # fmt: skip
     for case in table.cases:
         for solver in table.solvers:
             if solver not in case.rulings:
                 continue
             ruling, task = case.rulings[solver], case.tasks[solver]
-            writer.writerow((
+            rows.append((
                 case.chapter, case.label, solver, ruling.conduct.value, ruling.natural, one_line(ruling.reason),
-                task.status, task.iterations, task.visits, "" if math.isnan(case.margin) else repr(case.margin),
-                "" if case.interior is None else case.interior, task.task,
+                task.status, task.iterations, task.visits, case.margin, case.interior, task.task,
             ))  # fmt: skip
-    return text.getvalue()
+    return csv_text(rows)
 
 
 def _incomplete(table: HardTable) -> list[str]:

@@ -13,7 +13,7 @@ from reports.wording import MARK, number, one_line
 _LATEX = {
     "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_", "{": r"\{", "}": r"\}",
     "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "<": r"\textless{}", ">": r"\textgreater{}",
-    "|": r"\textbar{}", '"': r"\textquotedbl{}",
+    "|": r"\textbar{}", '"': r"\char34{}",
     "✓": r"$\bullet$", "●": r"$\bullet$", "✗": r"$\times$", "×": r"$\times$", "·": r"$\cdot$", "–": "--",
     "…": r"\ldots{}",
     "∞": r"$\infty$", "≤": r"$\le$", "≥": r"$\ge$", "→": r"$\to$", "√": r"$\surd$", "Δ": r"$\Delta$",

@@ -12,11 +12,10 @@ from harness.results import ScoreRow
 from reports.scorecard import DISTURBANCE, Scorecard, SolverCard, all_cells
 
 
-def _csv(heading: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    """Comma-separated text; numbers in full precision, NaN and None empty."""
+def csv_text(rows: Iterable[Sequence[object]]) -> str:
+    """Comma-separated text, the first row the heading; numbers in full precision, NaN and None empty."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(heading)
     for row in rows:
         writer.writerow([_plain(entry) for entry in row])
     return text.getvalue()
@@ -56,7 +55,7 @@ def scorecard_csv(card: Scorecard) -> str:
             ))  # fmt: skip
         rows += _tidy_spreads(solver)
         rows += _tidy_counts(solver)
-    return _csv(CARD_COLUMNS, rows)
+    return csv_text([CARD_COLUMNS, *rows])
 
 
 def _tidy(
@@ -130,4 +129,4 @@ def rows_csv(card: Scorecard) -> str:
                 row.score, *head, row.name, row.metric, row.value, row.tolerance, row.verdict.value, row.margin,
                 row.reference, *tail, detail,
             ))  # fmt: skip
-    return _csv(ROW_COLUMNS, rows)
+    return csv_text([ROW_COLUMNS, *rows])

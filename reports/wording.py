@@ -74,12 +74,24 @@ def spread_text(spread: Spread | None) -> str:
     return f"{number(spread.rms)} (n={spread.count})"
 
 
-def count_text(count: int) -> str:
-    """A count in three figures: 59.3M, 412k; exact below a thousand."""
+def count_text(count: float) -> str:
+    """A count in three figures: 59.3M, 412k; exact below a thousand, a dash where there is none."""
+    if not math.isfinite(count):
+        return "–"
     for size, letter in ((10**9, "G"), (10**6, "M"), (10**3, "k")):
         if count >= size:
             return f"{count / size:.3g}{letter}" if count / size < 999.5 else f"{count / size:.0f}{letter}"
-    return str(count)
+    return str(round(count))
+
+
+def time_text(time_s: float) -> str:
+    """A time [s] with its unit, three figures; a dash where there is none."""
+    if not math.isfinite(time_s):
+        return "–"
+    for unit, factor in (("s", 1.0), ("ms", 1e3), ("µs", 1e6)):
+        if time_s * factor >= 1.0:
+            return f"{time_s * factor:.3g} {unit}"
+    return f"{time_s * 1e9:.3g} ns"
 
 
 def work_text(card: SolverCard) -> tuple[str, str]:

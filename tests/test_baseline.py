@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import io
-import itertools
 import json
 import math
 import os
-import re
 import shutil
 import sqlite3
-import subprocess
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -97,6 +94,18 @@ def test_what_is_below_eight_eps_a_contact_is_rounding() -> None:
     risen = only(entry(energy_lost=0.0), entry(energy_lost=10 * floor))
     assert risen.change == pytest.approx(1.0, abs=1e-12)
     assert risen.verdict is Change.WORSE
+
+
+@pytest.mark.parametrize(
+    ("accepted", "now", "verdict"),
+    [
+        (1e-15, 9e-10, Change.SAME), (1e-15, 3e-9, Change.SAME), (1e-15, 4e-9, Change.WORSE), (0.1, 0.4, Change.WORSE),
+        (1.1, 1e-12, Change.BETTER),
+    ],
+)  # fmt: skip
+def test_symmetry_counts_from_its_own_bound_on(accepted: float, now: float, verdict: Change) -> None:
+    assert only(entry(symmetry_residual=accepted), entry(symmetry_residual=now)).verdict is verdict
+    assert only(entry(renumbering_residual=accepted), entry(renumbering_residual=now)).verdict is verdict
 
 
 def test_a_scene_without_contacts_has_the_floor_of_one() -> None:
@@ -460,8 +469,10 @@ def test_the_report_says_what_got_worse_and_by_how_much() -> None:
 
 
 def test_a_passing_report_says_so_and_counts() -> None:
-    same = compare(baseline(qce=entry(energy_lost=0.0)), {PAIR: entry(energy_lost=0.0)}, environment=HERE)
-    assert "Nothing got worse: 1 numbers compared" in gate_markdown(same)
+    now = {PAIR: entry(energy_lost=0.0), ("gr", SCENE): entry(energy_lost=0.0)}
+    same = compare(baseline(qce=entry(energy_lost=0.0)), now, environment=HERE)
+    assert "Nothing got worse: 1 numbers compared" in gate_markdown(same), "what is new has nothing to be compared with"
+    assert "1 new" in gate_markdown(same)
     assert "another environment" not in gate_markdown(same)
 
 
@@ -645,8 +656,9 @@ def test_a_commit_that_git_does_not_know_is_bad_input(
     monkeypatch.chdir(tmp_path)
     with pytest.raises(RevisionError):
         time_against("HEAD", [], timeout_s=10, on_progress=lambda line: None)
-    result = call("check", *gate_arguments(gated), "--against", "no-such-commit")
+    result = call("check", *gate_arguments(gated, out=tmp_path / "out"), "--against", "no-such-commit")
     assert result.exit_code == 2
+    assert not (tmp_path / "out").exists(), "it is found before anything is measured"
 
 
 def test_the_fixture_gates_one_solver_and_lists_what_got_worse(
@@ -663,67 +675,6 @@ def test_the_fixture_gates_one_solver_and_lists_what_got_worse(
     assert not impact_gate(solver, baseline=gated["baseline"]).failures
     with pytest.raises(BaselineError, match="no entry of qce"):
         impact_gate("qce", baseline=gated["baseline"])
-
-
-# The action.
-
-
-def action_script(step: str) -> str:
-    """The shell script of one step of action.yml."""
-    lines = iter((ROOT / "action.yml").read_text(encoding="utf-8").splitlines())
-    for line in lines:
-        if line.strip() == f"- name: {step}":
-            break
-    for line in lines:
-        if line.strip() == "run: |":
-            break
-    return "\n".join(itertools.takewhile(lambda line: line.startswith(" " * 8), lines))
-
-
-@pytest.mark.parametrize("code", [0, 1, 2])
-@pytest.mark.parametrize(
-    ("variables", "options"),
-    [
-        ({}, []),
-        ({"SOLVER": "my law.py:MyLaw", "TIER": "smoke"}, ["--solver", "my law.py:MyLaw", "--tier", "smoke"]),
-        ({"AGAINST": "$(touch x)"}, ["--against", "$(touch x)"]),
-    ],
-)
-def test_the_action_passes_its_inputs_on_as_they_are_and_ends_as_the_check_does(
-    variables: dict[str, str], options: list[str], code: int, tmp_path: Path
-) -> None:
-    fake = tmp_path / "impactbench"
-    fake.write_text(
-        f'#!/bin/bash\nprintf "%s\\n" "$@" > called\necho table > "$RUNNER_TEMP/impactbench-check.md"\nexit {code}\n',
-        encoding="utf-8",
-    )
-    fake.chmod(0o755)
-    inputs = {"BASELINE": "a b.json", "SOLVER": "", "TIER": "", "AGAINST": ""} | variables
-    places = {"RUNNER_TEMP": str(tmp_path), "GITHUB_STEP_SUMMARY": str(tmp_path / "summary")}
-    done = subprocess.run(
-        # As the runner calls it for "shell: bash".
-        ["bash", "--noprofile", "--norc", "-eo", "pipefail", "-c", action_script("Check")], cwd=tmp_path,
-        env=os.environ | inputs | places | {"PATH": f"{tmp_path}:{os.environ['PATH']}"},
-    )  # fmt: skip
-    assert done.returncode == code
-    called = (tmp_path / "called").read_text(encoding="utf-8").splitlines()
-    assert called[0] == "check"
-    assert called[1:3] == ["--baseline", "a b.json"]
-    assert called[-len(options) :] == options if options else "--solver" not in called
-    assert (tmp_path / "summary").read_text(encoding="utf-8") == "table\n"
-    assert not (tmp_path / "x").exists()
-    known = {name for parameter in impactbench.main.commands["check"].params for name in parameter.opts}
-    assert {word for word in called if word.startswith("--")} <= known
-
-
-def test_every_input_of_the_action_is_used_and_every_used_one_is_declared() -> None:
-    text = (ROOT / "action.yml").read_text(encoding="utf-8")
-    declared = re.findall(r"^  ([a-z-]+):$", text.partition("inputs:")[2].partition("\nruns:")[0], re.MULTILINE)
-    used = re.findall(r"\$\{\{ inputs\.([a-z-]+) \}\}", text)
-    assert sorted(declared) == sorted(used)
-    assert "python -m pip install" in action_script("Install impactbench")
-    # Text of a script that comes from an input would be run as a command.
-    assert "${{" not in action_script("Check") + action_script("Install impactbench")
 
 
 # What is checked in.

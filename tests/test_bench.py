@@ -14,7 +14,7 @@ from harness import work_precision
 from harness.isolation import Limits
 from harness.measurement import Measurement, Outcome
 from harness.run import Progress, Summary
-from harness.selection import SelectionError
+from harness.selection import SelectionError, build_scenario, choose_solver
 from harness.store import IncomparableResults, PlannedTask, Store, StoreError
 from harness.work_precision import (
     APPROACH,
@@ -29,6 +29,7 @@ from harness.work_precision import (
     TIERS,
     TIMES,
     VERIFICATION,
+    Dial,
     choose_bench,
     measure_errors,
     plan_bench,
@@ -116,6 +117,17 @@ def test_every_dial_is_a_setting_of_its_solver() -> None:
             assert len(set(dial.values)) == len(dial.values) > 1
             if name in SOLVERS:
                 assert set(dial.factors) <= set(SOLVERS[name].__dataclass_fields__), name  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize(("name", "dial"), [(name, dial) for name, dials in DIALS.items() for dial in dials])
+def test_every_dial_changes_the_work(name: str, dial: Dial) -> None:
+    # Of both integrators of the compliant laws: the pack has 299 contacts, and struck together no chain is exact.
+    scene = ("pool-break",) if dial.most < 299 else ("sphere-pack:spheres=100,start=hot",)
+    planned = [task for task in plan([name], scene, tier="smoke", repeats=1) if task.task.scenario == ERRORS]
+    assert {task.task.parameters["field"] for task in planned} == {dial.field}
+    problem = build_scenario(str(planned[0].task.parameters["scene"]), planned[0].task.parameters["parameters"]).problem  # type: ignore[arg-type]
+    coarse, fine = (choose_solver(planned[k].task.solver).solver.solve(problem) for k in (0, -1))
+    assert coarse.visits < fine.visits, f"{planned[0].task.solver} works as much as {planned[-1].task.solver}"
 
 
 def test_scaling_runs_with_default_settings_over_the_sizes_asked_for() -> None:

@@ -91,6 +91,14 @@ class Making:
                     number = self.task(SCALING, "gr", "sphere-pack", **task)  # type: ignore[arg-type]
                     self.record(number, None, Outcome.TIMED_OUT)
 
+    def growth_of(self, law: str, *, status: str = "converged") -> None:
+        """One law over three sizes, one round."""
+        for contacts in (10, 100, 1000):
+            self.times(
+                SCALING, law, "sphere-pack", 1e-6 * contacts, status=status, contacts=contacts,
+                parameters={"spheres": contacts},
+            )  # fmt: skip
+
     def first_solves(self) -> None:
         columns = {"first_s": 0.25, "second_s": 1e-4}
         self.record(self.task(COLD, "qce", "chain"), Measurement("", 0, 0, (), (Series(COLD, columns),)))
@@ -262,6 +270,28 @@ def test_the_same_store_gives_the_same_bytes(making: Making, tmp_path: Path) -> 
     first, again = write_bench(making.store, tmp_path / "a"), write_bench(making.store, tmp_path / "b")
     for one, other in zip(first, again, strict=True):
         assert one.read_bytes() == other.read_bytes(), one.name
+
+
+def test_a_law_that_the_user_brings_is_drawn_beside_those_of_the_registry(making: Making) -> None:
+    for law in ("qce", "/home/somebody/my_law.py:MyLaw", "lcp-apgd", "qce-lcp"):
+        making.growth_of(law)
+    (scaling,) = (draw() for name, draw in figures(Bench(making.store)).items() if name == "bench_scaling")
+    _, labels = scaling.axes[0].get_legend_handles_labels()
+    drawn = [label for label in labels if label != "exponent 1"]
+    assert [label.split()[0] for label in drawn] == ["QCE", "my_law.py:MyLaw"]
+
+
+def test_who_did_not_converge_is_said_in_words_with_who_solves_the_same_equations(making: Making) -> None:
+    making.growth_of("lcp-pgs", status="iteration limit")
+    assert "No method solved them at 1,000 contacts." in page(making)
+    making.growth_of("lcp-apgd")
+    making.growth_of("hertz", status="iteration limit")
+    text = page(making)
+    missed = "10 contacts (iteration limit), 100 contacts (iteration limit), 1,000 contacts (iteration limit)."
+    assert f"- `lcp-pgs` on sphere-pack, kick: {missed} The same equations are solved at 1,000 contacts by " in text
+    assert "at 1,000 contacts by lcp-apgd." in text
+    assert f"- `hertz` on sphere-pack, kick: {missed}\n" in text
+    assert "- `lcp-apgd`" not in text
 
 
 def test_a_store_without_a_bench_is_refused(making: Making, tmp_path: Path) -> None:

@@ -47,7 +47,6 @@ from scenarios.tiers import HARD, HARD_CASES, TIERS
 from solvers import SOLVERS, ImpactProblem, ImpactSolution, ProblemError, Solver, Status, UnsupportedProblem
 from solvers.boxed_lcp import project
 from solvers.quadratic_contact_energy import QuadraticContactEnergy
-from solvers.recovery import Recovered
 from tests.handmade_rows import HandmadeStore
 
 Instance = tuple[str, dict[str, object]]
@@ -147,7 +146,7 @@ def test_where_no_contact_approaches_every_solver_leaves_the_scene_as_it_is(inst
 
 
 def test_a_recovered_law_ends_on_every_cheap_jammed_case() -> None:
-    law = Recovered(QuadraticContactEnergy(max_iterations=100))
+    law = QuadraticContactEnergy(recover_after=100)
     for instance in HARD_CASES["squeezed from all sides"]:
         scene = build(instance)
         if (scene.problem.restitution == 1).all():

@@ -6,6 +6,8 @@ import csv
 import io
 import math
 import os
+import shutil
+import subprocess
 from pathlib import Path
 
 import pandas as pd
@@ -13,7 +15,7 @@ import pytest
 from rich.console import Console
 
 from harness.measurement import DESIDERATA, Verdict
-from reports import files
+from reports import files, latex
 from reports.latex import latex_escape
 from reports.scorecard import ReportError
 from reports.tables import render_terminal, scorecard, write_tables
@@ -218,6 +220,33 @@ def test_latex_tables_have_one_entry_for_each_column(tmp_path: Path) -> None:
             assert row.replace(r"\&", "").count("&") == len(columns) - 1
         assert text.count("{") == text.count("}")
         assert [text.count(rule) for rule in (r"\toprule", r"\midrule", r"\bottomrule")] == [1, 1, 1]
+
+
+# Default fonts and encoding, and booktabs, as the tables ask for: nothing else may be needed.
+DOCUMENT = r"""
+\documentclass{article}
+\usepackage{booktabs}
+\begin{document}
+\input{scorecard.tex}
+\input{table1.tex}
+LETTERS
+\end{document}
+"""
+
+
+@pytest.mark.skipif(shutil.which("pdflatex") is None, reason="there is no LaTeX here")
+def test_latex_sets_the_tables_and_every_letter_that_is_escaped(tmp_path: Path) -> None:
+    store = small_store()
+    store.all_six('a "law" of 100 % & <more>_here.py:My|Law')
+    write_tables(store, tmp_path)
+    letters = latex_escape("".join(latex._LATEX))
+    (tmp_path / "page.tex").write_text(DOCUMENT.replace("LETTERS", letters), encoding="ascii")
+    done = subprocess.run(
+        ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "page.tex"],
+        cwd=tmp_path, capture_output=True, text=True, errors="replace",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout[-2000:]
+    assert (tmp_path / "page.pdf").stat().st_size > 0
 
 
 def test_the_markdown_page_says_how_to_repeat_the_run(tmp_path: Path) -> None:

@@ -64,8 +64,11 @@ def test_every_sample_is_the_time_of_one_solve(problem: ImpactProblem, monkeypat
 
 def test_a_long_solve_is_sampled_once(problem: ImpactProblem, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(timing, "LONG_S", 0.0)
-    timed = time_solver(Counting(), problem, samples=4)
-    assert len(timed.cpu_s) == 1
+    solver = Counting()
+    timed = time_solver(solver, problem, samples=4)
+    assert len(timed.cpu_s) == timed.solves == 1
+    # One that compiles, the fresh one, the sample.
+    assert len(solver.problems) == 3
 
 
 def test_the_fresh_solve_meets_a_problem_that_nobody_solved_before(problem: ImpactProblem) -> None:
