@@ -9,11 +9,13 @@ Everything below is imported when it is used, so that `--help` answers at once.
 from __future__ import annotations
 
 import importlib
+import math
 import os
+import re
 import shlex
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -27,6 +29,7 @@ if TYPE_CHECKING:
     from harness.measurement import Measurement, Score, Verdict
     from harness.revision import TimeComparison
     from harness.run import Summary
+    from harness.simulation import Schedule, Simulation
     from harness.store import PlannedTask, Store
     from scenarios import CATALOG
     from scenarios.scenario import Reference, Scenario
@@ -305,19 +308,16 @@ def bench(
             sys.exit(EXIT_INTERRUPTED)
         _print_summary(out, summary)
         with _open(out) as store:
-            written = write_bench(store, out)
-        click.echo(
-            f"written to {out}: " + ", ".join(path.name for path in written if path.suffix in (".md", ".csv", ".png"))
-        )
+            _name_bench_files(out, write_bench(store, out))
     sys.exit(EXIT_FAILED_TASKS if summary.lost else 0)
 
 
 @main.command(epilog=EXIT_CODES)
-@click.argument("scene", metavar="SCENE[:KEY=VALUE,…]")
+@click.argument("scenes", metavar="SCENE[:KEY=VALUE,…]…", nargs=-1, required=True)
 @click.option(
-    "--solver", "solver", default=None, metavar="NAME[:KEY=VALUE,…]",
+    "--solver", "solvers", multiple=True, metavar="NAME[:KEY=VALUE,…]",
     help="Who solves the impacts: any solver, or qce-lcp-fast and qce-lcp-accurate, which are made for many spheres. "
-    "Default: the scene's own.",
+    "Repeatable. Default: the scene's own.",
 )  # fmt: skip
 @click.option("--steps", type=click.IntRange(min=1), default=None, metavar="N", help="Steps of the whole run.")
 @click.option(
@@ -341,84 +341,174 @@ def bench(
     help="Results folder of this run alone.",
 )  # fmt: skip
 def simulate(
-    scene: str, solver: str | None, steps: int | None, cycles: int | None, until_pattern: bool,
+    scenes: tuple[str, ...], solvers: tuple[str, ...], steps: int | None, cycles: int | None, until_pattern: bool,
     frame_every: int | None, checkpoint_every: int, pictures: bool, video: bool, seed: int, fresh: bool, out: Path,
 ) -> None:  # fmt: skip
     """Run a moving scene; then write its page, figures and pictures.
 
     Every step is a row of OUT/series.csv; frames, what the scene is judged by, and a checkpoint are kept beside it. An
     interrupted run goes on, bit for bit, when the same command is given again, and so does one that is given more
-    steps. `impactbench list moving` names the scenes and their parameters.
+    steps. `impactbench list moving` names the scenes and their parameters. Several solvers, or several members of one
+    family of scenes, run one after the other in folders of their own in OUT, and a page compares them.
 
     \b
     Examples:
       impactbench simulate cradle-3d --solver qce --out cradle
+      impactbench simulate cradle-3d:raised=1 cradle-3d:raised=2 cradle-3d:raised=3 --out cradles
+      impactbench simulate pool-break --solver qce --solver gr --solver lcp-pgs --out break
       impactbench simulate granular-shake --video --out shake
       impactbench simulate extended-pattern:pattern=hexagons --cycles 300 --until-pattern --out hexagons
     """  # noqa: D301
     with _explained_errors():
         from harness.selection import choose_moving, choose_resolver
-        from harness.simulation import Schedule, Simulation
-        from harness.simulation import simulate as run_simulation
-        from reports.progress import step_display
+        from harness.simulation import Simulation
 
-        chosen = choose_moving(scene)
-        specification, law = choose_resolver(solver or chosen.default_solver)
-        schedule = Schedule(
-            steps=_wanted_steps(chosen, steps, cycles), frame_every=frame_every or chosen.frame_every,
-            checkpoint_every=checkpoint_every,
-        )  # fmt: skip
+        # What is named twice runs once.
+        chosen = {choice.label: choice for choice in map(choose_moving, scenes)}
+        if len({choice.name for choice in chosen.values()}) > 1:
+            raise BadInput("several scenes must be members of one family: they are compared")
+        runs = {
+            _run_name(name, specification, chosen, solvers): (choice, specification, law)
+            for name, choice in chosen.items()
+            for specification, law in map(choose_resolver, solvers or (choice.default_solver,))
+        }
         if fresh:
             _set_aside(out)
-        _say(f"{chosen.label} by {specification}: {schedule.steps} steps; results go to {out}")
-        try:
-            with _terminated_as_interrupted(), step_display() as display:
-                why = run_simulation(
-                    Simulation(chosen, specification, law, seed), out, schedule, command=_command_line(),
-                    until=chosen.reached if until_pattern else lambda _: False, on_step=display,
-                )  # fmt: skip
-        except KeyboardInterrupt:
-            _say(f"\ninterrupted; the same command goes on:\n  {_command_line(without='--fresh')}")
-            sys.exit(EXIT_INTERRUPTED)
-        _say(why)
-        _write_simulation(out, chosen, pictures=pictures, video=video)
+        folders = {name: out / _folder_name(name) if len(runs) > 1 else out for name in runs}
+        for name, (choice, specification, law) in runs.items():
+            schedule = _schedule(choice, steps, cycles, frame_every, checkpoint_every)
+            _say(f"{choice.label} by {specification}: {_extent(choice, schedule)}; results go to {folders[name]}")
+            _run_simulation(Simulation(choice, specification, law, seed), folders[name], schedule, until_pattern)
+            _write_simulation(folders[name], choice, pictures=pictures, video=video)
+        if len(runs) > 1:
+            _write_comparison(folders, out, choice)
 
 
-def _wanted_steps(scene: MovingScene, steps: int | None, cycles: int | None) -> int:
-    """Steps of the whole run."""
+def _run_name(label: str, solver: str, scenes: Collection[str], solvers: Collection[str]) -> str:
+    """What tells a run from the others: its scene's parameters that differ, its solver, or both."""
+    parameters = _parameters(label)
+    own = [parameter for parameter in parameters if any(parameter not in _parameters(other) for other in scenes)]
+    return ", ".join([*own, solver] if len(solvers) > 1 or not own else own)
+
+
+def _parameters(label: str) -> list[str]:
+    """Parameters of a scene's label: "name(a=1, b=2)" → a=1, b=2."""
+    return label.partition("(")[2].removesuffix(")").split(", ")
+
+
+def _run_simulation(simulation: Simulation, out: Path, schedule: Schedule, until_pattern: bool) -> None:
+    """Run one scene by one solver, or say how an interrupted run goes on."""
+    from harness.simulation import simulate as run_simulation
+    from reports.progress import step_display
+
+    try:
+        with _terminated_as_interrupted(), step_display() as display:
+            why = run_simulation(
+                simulation, out, schedule, command=_command_line(),
+                until=simulation.scene.reached if until_pattern else lambda _: False, on_step=display,
+            )  # fmt: skip
+    except KeyboardInterrupt:
+        _say(f"\ninterrupted; the same command goes on:\n  {_command_line(without='--fresh')}")
+        sys.exit(EXIT_INTERRUPTED)
+    _say(why)
+
+
+def _folder_name(specification: str) -> str:
+    """A solver's folder: its specification without what a path may not hold."""
+    return re.sub(r"[^\w.=,-]+", "_", specification)
+
+
+def _schedule(
+    scene: MovingScene, steps: int | None, cycles: int | None, frame_every: int | None, checkpoint_every: int
+) -> Schedule:  # fmt: skip
+    """How long a scene runs: as it says itself, or as it is told in steps or cycles."""
+    from harness.simulation import Schedule
+
     if steps is not None and cycles is not None:
         raise BadInput("--steps and --cycles say the same thing; give one")
-    if cycles is None:
-        return steps or scene.default_steps
-    if scene.steps_per_cycle == 0:
-        raise BadInput(f"{scene.name} has no cycles: nothing drives it; give --steps")
-    return cycles * scene.steps_per_cycle
+    duration = scene.duration if steps is None else math.inf
+    if cycles is not None:
+        if scene.steps_per_cycle == 0 and math.isinf(scene.period):
+            raise BadInput(f"{scene.name} has no cycles: nothing in it repeats; give --steps")
+        steps, duration = cycles * scene.steps_per_cycle or None, cycles * scene.period
+    return Schedule(steps or scene.default_steps, frame_every or scene.frame_every, checkpoint_every, duration)
+
+
+def _extent(scene: MovingScene, schedule: Schedule) -> str:
+    """How long a run is, in words."""
+    if math.isinf(schedule.duration):
+        return f"{schedule.steps} steps"
+    return f"{schedule.duration:.6g} {scene.units.time}, {schedule.steps} steps at most"
 
 
 def _write_simulation(out: Path, scene: MovingScene, *, pictures: bool, video: bool) -> None:
-    from reports.pictures import View
     from reports.simulation import write_pictures, write_simulation
 
     with _open(out) as store:
-        written = write_simulation(store, out)
+        written = write_simulation(store, out, scene)
     if pictures or video:
-        written += write_pictures(
-            out, color=scene.color, color_from=scene.color_from, video=video, view=View(), progress=_say
-        )
+        written += write_pictures(out, scene, video=video, progress=_say)
     click.echo((out / "simulation.md").read_text(encoding="utf-8"))
     click.echo("written: " + ", ".join(str(path) for path in written if path.suffix in (".md", ".png", ".mp4")))
+
+
+def _write_comparison(runs: dict[str, Path], out: Path, scene: MovingScene) -> None:
+    from reports.comparison import write_comparison
+
+    written = write_comparison(runs, out, scene)
+    click.echo((out / "comparison.md").read_text(encoding="utf-8"))
+    click.echo("written: " + ", ".join(str(path) for path in written if path.suffix in (".md", ".png")))
+
+
+@main.command()
+@click.argument("runs", nargs=-1, metavar="[RUN]…", type=click.Path(exists=True, file_okay=False, path_type=Path))
+@click.option(
+    "--out", type=click.Path(file_okay=False, path_type=Path), default=Path("patterns"), show_default=True,
+    help="Folder of the records.",
+)  # fmt: skip
+def patterns(runs: tuple[Path, ...], out: Path) -> None:
+    """Keep the height maps of extended-pattern runs; then write table and figures of all that are kept.
+
+    Each RUN is a results folder of `simulate`; what it has to show goes into one small file in OUT, in place of an
+    earlier one of the same pattern. Without RUN the table and the figures are made again from these files alone.
+
+    \b
+    Examples:
+      impactbench patterns hexagons squares
+      impactbench patterns
+    """  # noqa: D301
+    with _explained_errors():
+        from harness.patterns import read_record, record_of_run, write_record
+        from reports.files import prepare
+        from reports.patterns import write_patterns
+
+        prepare(out)
+        for run in runs:
+            record = record_of_run(run)
+            _say(f"written: {write_record(out / f'{record.pattern}.npz', record)}")
+        written = write_patterns([read_record(path) for path in sorted(out.glob("*.npz"))], out)
+        click.echo((out / "patterns.md").read_text(encoding="utf-8"))
+        click.echo("written: " + ", ".join(str(path) for path in written))
 
 
 @main.command()
 @_out_option
 def figures(out: Path) -> None:
-    """Write tables and figures again from the results in OUT; nothing is measured.
+    """Write tables and figures again from the results in OUT, a scorecard's or a bench's; nothing is measured.
 
     \b
-    Example:
+    Examples:
       impactbench figures --out results
+      impactbench figures --out bench
     """  # noqa: D301
     with _explained_errors():
+        from reports.bench import write_bench
+        from reports.bench_rows import holds_bench
+
+        with _open(out) as store:
+            if holds_bench(store):
+                _name_bench_files(out, write_bench(store, out))
+                return
         _write_reports(out, _tables_and_figures)
 
 
@@ -584,7 +674,7 @@ def check(
     baseline: Path, tier: str | None, solvers: tuple[str, ...], out: Path, against: str | None, report: Path | None,
     **options: Any,
 ) -> None:  # fmt: skip
-    """Compare energy error, momentum, one-sidedness, residuals and counted work with an accepted baseline.
+    """Compare energy error, momentum, one-sidedness, symmetry, residuals and counted work with an accepted baseline.
 
     One-sided, on a logarithm with a floor of 8 eps m: what is rounding may vary, and an error that grew from 2e-9 to
     1e-8 fails. Wall time is compared with another commit only (--against), which is timed in turns with this tree.
@@ -597,10 +687,13 @@ def check(
     """  # noqa: D301
     with _explained_errors():
         from harness import baseline as gate
+        from harness.revision import find_commit
         from reports.gate import gate_markdown, render_gate, render_times
 
         accepted = gate.read_baseline(baseline)
         gate.check_same_run(accepted, tier=tier or accepted.tier, seed=accepted.seed)
+        if against:
+            find_commit(against)
         plan = gate.plan_gate(tier=accepted.tier, seed=accepted.seed, solvers=solvers or accepted.solvers)
         chosen = sorted({planned.task.solver for planned in plan}) if solvers else None
         gate.gated_entries(accepted, chosen)
@@ -792,6 +885,11 @@ def _write_reports(out: Path, write: Callable[[Store, Path], list[Path]]) -> Non
         click.echo(f"  {path.relative_to(out) if path.is_relative_to(out) else path}")
 
 
+def _name_bench_files(out: Path, written: list[Path]) -> None:
+    names = (path.name for path in written if path.suffix in (".md", ".csv", ".png"))
+    click.echo(f"written to {out}: {', '.join(names)}")
+
+
 def _tables_only(store: Store, folder: Path) -> list[Path]:
     from reports.hard_cases import write_hard_cases
     from reports.tables import write_tables
@@ -885,10 +983,9 @@ def _first_line(thing: object) -> str:
 
 
 def _write_text(path: Path, text: str) -> None:
-    try:
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise BadInput(f"cannot write {path}: {error.strerror}") from error
+    from reports.files import write_whole
+
+    write_whole(path, text.encode())
     click.echo(f"written: {path}", err=True)
 
 

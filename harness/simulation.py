@@ -2,7 +2,7 @@
 
     results.sqlite       what was measured: the whole run, and probes of single impacts (see `harness.store`)
     series.csv           one row a step (`COLUMNS`)
-    measures.csv         one row a frame: what the scene is judged by
+    measures.csv         what the scene is judged by, at frames or more often
     trajectory-*.npz     frames (see `harness.trajectory`)
     checkpoint.npz       the whole state, and how many rows and frames go with it
 
@@ -19,6 +19,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 
 from harness import desiderata
 from harness.checked import ratio
@@ -32,17 +33,20 @@ from harness.measurement import (
     Outcome,
     Score,
     Task,
+    lower_bound,
     not_applicable,
     shown,
     upper_bound,
 )
 from harness.run import COMPARED
 from harness.store import Ending, PlannedTask, Store
-from harness.trajectory import Frame, RowWriter, TrajectoryWriter, read_rows
+from harness.trajectory import Frame, RowWriter, TrajectoryWriter, read_table
 from scenarios.scenario import Invariant, Scenario
 from scenarios.world.checkpoint import CheckpointError, checkpoint, resume
+from scenarios.world.events import EventWorld
 from scenarios.world.impact import Streamed
 from scenarios.world.moving_scene import MovingScene, MovingWorld
+from scenarios.world.rigid_world import RigidWorld
 from scenarios.world.stepping import StepReport
 from solvers import ImpactProblem, ProblemError, Solver, UnsupportedProblem
 from solvers.solution import Floats
@@ -56,7 +60,7 @@ COLUMNS = (
     "kinetic", "potential", "impact", "friction", "correction", "shaking", "integration", "wall_s",
 )  # fmt: skip
 """Columns of the series; all but wall_s come out the same whenever the run is repeated."""
-# Impacts of a run that are scored by themselves, evenly spread over it.
+# Impacts of a run with a fixed step that are scored by themselves, evenly spread over it.
 PROBES = 8
 # A probe solves its impact again and again, renumbered and mirrored: above this many contacts that takes minutes.
 MOST_PROBED = 2_000
@@ -76,11 +80,15 @@ class Schedule:
     """Steps between two frames."""
     checkpoint_every: int
     """Steps between two checkpoints."""
+    duration: float = math.inf
+    """Time of the whole run; it ends before if its steps are made."""
 
     def __post_init__(self) -> None:
         for name, value in asdict(self).items():
-            if value < 1:
+            if value < 1 and name != "duration":
                 raise SimulationError(f"{name} must be at least 1, not {value}")
+        if not self.duration > 0.0:
+            raise SimulationError(f"duration must be above 0, not {self.duration:g}")
 
 
 @dataclass(frozen=True)
@@ -103,6 +111,7 @@ class State:
     """Steps of the whole run."""
     measures: Mapping[str, float]
     """What the scene measured last."""
+    energy_unit: str = "J"
 
 
 def simulate(
@@ -121,7 +130,7 @@ def simulate(
         folder: results folder of this run alone.
         schedule: how long, and what is kept when.
         command: as it was called, for the record.
-        until: ends the run where it says so of the scene's measures, at a frame.
+        until: ends the run where it says so of the scene's measures, when they are taken.
         on_step: called after every step.
 
     Returns:
@@ -160,20 +169,31 @@ def _run(
 ) -> str:
     """Step until the schedule or the scene says that it is enough."""
     world = recorder.world
-    probe_every = max(schedule.steps // PROBES, 1)
     while world.steps < schedule.steps:
-        if world.over:
-            return f"no further impact will come after step {world.steps}"
+        ahead = recorder.next_time()
+        if ahead > schedule.duration or ahead == math.inf:
+            recorder.watch(schedule.duration)
+            end = "no further impact will come" if ahead == math.inf else f"the time {schedule.duration:.6g} is reached"
+            return f"{end} after step {world.steps}"
         try:
-            if world.steps % probe_every == probe_every // 2:
+            if _is_probed(world, schedule):
                 probes.take(world)
-            report = recorder.step()
+            report = recorder.step(ahead)
         except (ProblemError, UnsupportedProblem, InvalidSolution) as error:
             raise SimulationError(f"step {world.steps + 1}: {error}") from error
-        on_step(State(report, schedule.steps, recorder.measures))
-        if world.steps % schedule.frame_every == 0 and until(recorder.measures):
+        on_step(State(report, schedule.steps, recorder.measures, recorder.energy_unit))
+        if recorder.measured_now and until(recorder.measures):
             return f"what was waited for holds at step {world.steps}"
     return f"all {schedule.steps} steps are made"
+
+
+def _is_probed(world: MovingWorld, schedule: Schedule) -> bool:
+    """Whether the next impact is scored by itself."""
+    if isinstance(world, EventWorld):
+        # Nobody knows how many impacts will come: the first, second, fourth, eighth, …
+        return (world.steps + 1).bit_count() == 1
+    every = max(schedule.steps // PROBES, 1)
+    return world.steps % every == every // 2
 
 
 class _Recorder:
@@ -181,43 +201,99 @@ class _Recorder:
 
     def __init__(self, simulation: Simulation, folder: Path, schedule: Schedule) -> None:
         self._folder, self._schedule, self._scene = folder, schedule, simulation.scene
+        self.energy_unit = simulation.scene.units.energy
         try:
             self.world = simulation.scene.world(solver=simulation.solver, seed=simulation.seed)
             kept = folder / CHECKPOINT
-            if kept.exists():
+            resumed = kept.exists()
+            if resumed:
                 resume(self.world, kept.read_bytes())
         except CheckpointError as error:
             raise SimulationError(f"{folder / CHECKPOINT}: {error}") from error
         except ProblemError as error:
             raise SimulationError(str(error)) from error
         made = self.world.steps
-        frames = made // schedule.frame_every + 1 if kept.exists() else 0
+        self._timed = isinstance(self.world, EventWorld)
+        self._measure_every = schedule.frame_every if self._timed else self._scene.measure_every or schedule.frame_every
+        # Frames of a scene from impact to impact are those before its last impact; else one at the start, too.
+        frames = self._due(self.world.time) if self._timed else made // schedule.frame_every + 1
+        measured = frames if self._timed else made // self._measure_every + 1
         self.measures = dict(self._scene.measure(self.world))
+        self.measured_now = False
+        """Whether they were taken in the last step, or in the flight before it."""
         self._rows = RowWriter(folder / STEPS, COLUMNS, rows=made)
-        self._measured = RowWriter(folder / MEASURES, ("step", "time", *self.measures), rows=frames)
-        self._trajectory = TrajectoryWriter(folder, frames=frames)
-        if frames == 0:
+        columns = ("step", "time", *self.measures)
+        self._measured = RowWriter(folder / MEASURES, columns, rows=measured if resumed else 0)
+        self._trajectory = TrajectoryWriter(folder, frames=frames if resumed else 0)
+        if not resumed and not self._timed:
             self._frame()
+            self._measure()
 
-    def step(self) -> StepReport:
-        """Go on by one step."""
+    def step(self, ahead: float) -> StepReport:
+        """Go on by one step, which is known to end at a time where the scene goes from impact to impact."""
+        self.measured_now = False
+        if self._timed:
+            self._watch_until(self._due(ahead))
         begin = time.perf_counter()
         report = self.world.step()
         wall_s = time.perf_counter() - begin
         known = asdict(report) | asdict(report.energy) | {"status": report.status.label, "wall_s": wall_s}
         self._rows.append([known[column] for column in COLUMNS])
-        if self.world.steps % self._schedule.frame_every == 0:
-            self.measures = dict(self._scene.measure(self.world))
+        if not self._timed and self.world.steps % self._measure_every == 0:
+            self._measure()
+        if not self._timed and self.world.steps % self._schedule.frame_every == 0:
             self._frame()
         if self.world.steps % self._schedule.checkpoint_every == 0:
             self.checkpoint()
         return report
 
+    def next_time(self) -> float:
+        """Time of the next impact where the scene goes from impact to impact, else a time after now; inf at the end."""
+        world = self.world
+        if isinstance(world, EventWorld):
+            return world.time + world.flight.time_to_impact()
+        # Times are sums of steps: rounding must not add one.
+        return math.inf if world.over else world.time * (1.0 + 1e-12) + math.ulp(0.0)
+
+    def watch(self, until: float) -> None:
+        """Take the frames of a free flight up to a time, that one included."""
+        if self._timed and math.isfinite(until):
+            # A time that is a whole number of frames may miss the last one by rounding.
+            self._watch_until(math.floor(until / self._scene.frame_time * (1.0 + 1e-12)) + 1)
+
     def checkpoint(self) -> None:
-        """Keep the state. Rows first: a checkpoint never says more than there is."""
+        """Keep the state. Rows and frames first: a checkpoint never says more than there is."""
         self._rows.flush()
         self._measured.flush()
+        self._trajectory.flush()
         replace_file(self._folder / CHECKPOINT, checkpoint(self.world))
+
+    def _due(self, now: float) -> int:
+        """Frames before a time, where they are at equal times."""
+        return math.ceil(now / self._scene.frame_time)
+
+    def _watch_until(self, frames: int) -> None:
+        """Take the frames that are missing of so many, in the flight to the next impact; the world stays as it is."""
+        world = self.world
+        assert isinstance(world, EventWorld)
+        if frames <= self._trajectory.frames:
+            return
+        here = {name: array.copy() for name, array in world.state().items()}
+        for k in range(self._trajectory.frames, frames):
+            moment = k * self._scene.frame_time
+            try:
+                world.flight.advance(moment - world.time)
+                world.time = moment
+                self._frame()
+                self._measure()
+            finally:
+                # Also where it is interrupted: the checkpoint is of the last impact.
+                world.restore(here)
+
+    def _measure(self) -> None:
+        self.measured_now = True
+        self.measures = dict(self._scene.measure(self.world))
+        self._measured.append([self.world.steps, self.world.time, *self.measures.values()])
 
     def _frame(self) -> None:
         world = self.world
@@ -226,9 +302,9 @@ class _Recorder:
             Frame(
                 world.steps, world.time, height,
                 world.spheres.by_label(world.spheres.place), world.spheres.by_label(world.spheres.velocity),
+                world.orientation if isinstance(world, RigidWorld) else np.zeros((0, 4)),
             )
         )  # fmt: skip
-        self._measured.append([world.steps, world.time, *self.measures.values()])
 
 
 class _Probes:
@@ -266,7 +342,7 @@ def _record_run(simulation: Simulation, folder: Path, store: Store, run: int, *,
         return
     (number,) = store.plan([_task(simulation, RUN, steps=steps)], run=run)
     if number in {planned.number for planned in store.pending()}:
-        store.record(number, _whole_run(folder), run=run)
+        store.record(number, _whole_run(folder, simulation), run=run)
 
 
 def _task(simulation: Simulation, what: str, **more: object) -> PlannedTask:
@@ -301,14 +377,16 @@ def _momenta(problem: ImpactProblem, block: int) -> Iterator[Invariant]:
             yield Invariant(f"momentum {name}", direction)
 
 
-def _whole_run(folder: Path) -> Ending:
+def _whole_run(folder: Path, simulation: Simulation) -> Ending:
     """What holds of all steps together, from the series."""
-    rows = read_rows(folder / STEPS)
-    column = {name: np.array(rows[name], dtype=np.float64) for name in COLUMNS if name != "status"}
-    scores = [*_energy_scores(column), *_statistics(column), *_last_measures(folder)]
-    unfinished = sum(status != "converged" for status in rows["status"])
-    scores.append(shown("run", "steps whose impact did not converge", unfinished / len(rows["status"])))
-    last = rows["status"][-1]
+    series = read_table(folder / STEPS)
+    column = {name: series[name].to_numpy() for name in COLUMNS if name != "status"}
+    measures = read_table(folder / MEASURES)
+    scores = [*_energy_scores(column), *_statistics(column), *_last_measures(measures)]
+    scores += [*_judged_scores(measures, simulation.scene.judged), *_unjudged(simulation)]
+    unfinished = float((series["status"] != "converged").mean())
+    scores.append(shown("run", "steps whose impact did not converge", unfinished))
+    last = str(series["status"].iloc[-1])
     return Ending(
         Outcome.MEASURED, wall_s=float(column["wall_s"].sum()),
         measurement=Measurement(last, int(column["iterations"].sum()), int(column["contacts"].sum()), tuple(scores)),
@@ -343,9 +421,40 @@ def _statistics(column: Mapping[str, Floats]) -> Iterator[Score]:
             yield shown("run", f"{name}, {word}", float(value))
 
 
-def _last_measures(folder: Path) -> Iterator[Score]:
+def _last_measures(measures: pd.DataFrame) -> Iterator[Score]:
     """The scene's own measures at the last frame."""
-    rows = read_rows(folder / MEASURES)
-    for name, values in rows.items():
+    for name in measures.columns:
         if name not in ("step", "time"):
-            yield shown("scene", f"{name}, at the end", float(values[-1]))
+            yield shown("scene", f"{name}, at the end", float(measures[name].iloc[-1]))
+
+
+def _judged_scores(measures: pd.DataFrame, judged: Mapping[str, str]) -> Iterator[Score]:
+    """SYM and BRK over the run, where the scene has a measure for them; the bounds are those of a single impact."""
+    for name, measure in judged.items():
+        values = measures[measure].dropna()
+        if values.empty:
+            yield not_applicable(name, measure, "the run is too short for it")
+        elif name == "SYM":
+            wrong = values > desiderata.SYMMETRY_TOLERANCE
+            # Billiards multiply any difference at every impact: when it began to grow says more than how far it got.
+            since = {"passes until step": int(measures["step"][wrong.idxmax()])} if wrong.any() else {}
+            yield upper_bound(
+                name, f"{measure}, largest over the run", float(values.max()), desiderata.SYMMETRY_TOLERANCE,
+                detail=since,
+            )  # fmt: skip
+        else:
+            yield lower_bound(
+                name, f"{measure}, smallest over the run", float(values.min()), desiderata.BREAK_TOLERANCE,
+                detail={"step": int(measures["step"][values.idxmin()])},
+            )  # fmt: skip
+
+
+def _unjudged(simulation: Simulation) -> Iterator[Score]:
+    """Why a run has no number for some of the six."""
+    yield not_applicable("WAV", "wave effect", "a run takes one course, and WAV compares neighboring ones: scorecard")
+    judged = simulation.scene.judged
+    if "BRK" not in judged:
+        yield not_applicable("BRK", "break-away", "nothing says what should part in this scene")
+    if isinstance(simulation.solver, Streamed):
+        for name in ("SYM", "MOM", "ONE"):
+            yield not_applicable(name, "single impacts", "the packed solver keeps no impulses to judge; qce-lcp does")

@@ -1,11 +1,14 @@
 """What a simulation leaves on disk: frames of the motion, and rows of numbers. Both can be cut back and gone on with.
 
-    trajectory-000000.npz, trajectory-000001.npz, …    `FRAMES_PER_FILE` frames each:
+    trajectory-000000.npz, …    frames from the one that the name counts; `BODIES_PER_FILE` bodies in all, or one frame:
         step      (frames,)             steps made
-        time      (frames,)             [s]
-        height    (frames,)             of the container over its place at rest [m]
-        place     (frames, bodies, 4)   centers in the container's frame, radius [m], float32, in the order of the start
-        velocity  (frames, bodies, 3)   [m/s], float32
+        time      (frames,)             since the start
+        height    (frames,)             of the container over its place at rest
+        place     (frames, bodies, 4)   centers in the container's frame, radius; float32, in the order of the start
+        velocity  (frames, bodies, 3)   float32
+        turn      (frames, bodies, 4)   orientations as quaternions (w, x, y, z), float32; missing where all are spheres
+
+in the units of the scene.
 
 A frame is float32: it is to be looked at and measured, not to go on from (see `harness.simulation` for checkpoints).
 """
@@ -16,17 +19,19 @@ import csv
 import io
 import os
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from harness.files import replace_file
 from harness.store import StoreError
 from solvers.solution import Floats
 
-FRAMES_PER_FILE = 16
+BODIES_PER_FILE = 240_000
+"""Bodies of all frames of a file together: some megabytes."""
 # Rows of the series that are held back before they are written: a write a step would cost more than a small step.
 ROWS_HELD = 500
 
@@ -37,17 +42,18 @@ class Frame:
 
     step: int
     time: float
-    """[s]."""
     height: float
-    """Of the container over its place at rest [m]."""
+    """Of the container over its place at rest."""
     place: Floats
-    """Centers and radii [m], shape (bodies, 4)."""
+    """Centers and radii, shape (bodies, 4)."""
     velocity: Floats
-    """[m/s], shape (bodies, 3)."""
+    """Shape (bodies, 3)."""
+    turn: Floats = field(default_factory=lambda: np.zeros((0, 4)))
+    """Orientations as quaternions (w, x, y, z), shape (bodies, 4); (0, 4) where all bodies are spheres."""
 
 
 class TrajectoryWriter:
-    """Appends frames to the files of a folder; the last file is written anew with each.
+    """Appends frames to the files of a folder; they are held back until `flush`, or until a file is full.
 
     Args:
         folder: exists.
@@ -60,27 +66,49 @@ class TrajectoryWriter:
     def __init__(self, folder: Path, *, frames: int = 0) -> None:
         self._folder = folder
         self.frames = frames
-        """Frames written so far."""
-        whole, rest = divmod(frames, FRAMES_PER_FILE)
-        self._open: list[Frame] = list(_read_file(_file(folder, whole)))[:rest] if rest else []
-        if len(self._open) < rest:
-            raise StoreError(f"{_file(folder, whole)} has fewer frames than its checkpoint says")
-        for path in sorted(folder.glob("trajectory-*.npz"))[whole + (1 if rest else 0) :]:
-            path.unlink()
+        """Frames taken so far."""
+        self._open: list[Frame] = []
+        """Frames of the last file."""
+        self._held = False
+        """Whether that file lacks some of them."""
+        kept = 0
+        for path in sorted(folder.glob("trajectory-*.npz")):
+            first = int(path.stem.rpartition("-")[2])
+            if first >= frames:
+                path.unlink()
+                continue
+            self._open = list(_read_file(path))[: frames - first]
+            # Those after them must go from the file as well.
+            self._held = True
+            kept = first + len(self._open)
+        if kept < frames:
+            raise StoreError(f"{folder} has {kept} frames, fewer than its checkpoint says: {frames}")
+        self._close_if_full()
 
     def append(self, frame: Frame) -> None:
-        """Add one frame; it is on disk when this returns."""
+        """Add one frame."""
         self._open.append(frame)
-        write_arrays(
-            _file(self._folder, self.frames // FRAMES_PER_FILE),
-            step=np.array([f.step for f in self._open]),
-            time=np.array([f.time for f in self._open]),
-            height=np.array([f.height for f in self._open]),
-            place=np.array([f.place for f in self._open], dtype=np.float32),
-            velocity=np.array([f.velocity for f in self._open], dtype=np.float32),
-        )
+        self._held = True
         self.frames += 1
-        if len(self._open) == FRAMES_PER_FILE:
+        self._close_if_full()
+
+    def flush(self) -> None:
+        """Write what is held back."""
+        if self._held:
+            self._held = False
+            write_arrays(
+                self._folder / f"trajectory-{self.frames - len(self._open):06}.npz",
+                step=np.array([f.step for f in self._open]),
+                time=np.array([f.time for f in self._open]),
+                height=np.array([f.height for f in self._open]),
+                place=np.array([f.place for f in self._open], dtype=np.float32),
+                velocity=np.array([f.velocity for f in self._open], dtype=np.float32),
+                **_turns(self._open),
+            )
+
+    def _close_if_full(self) -> None:
+        if sum(len(frame.place) for frame in self._open) >= BODIES_PER_FILE:
+            self.flush()
             self._open = []
 
 
@@ -130,10 +158,12 @@ class RowWriter:
         self._held = []
 
 
-def read_rows(path: Path) -> dict[str, list[str]]:
-    """Columns of a CSV file, as text; empty where there is no row."""
-    heading, *rows = csv.reader(_lines(path)) if path.exists() else [[]]
-    return {name: [row[k] for row in rows] for k, name in enumerate(heading)} if rows else {}
+def read_table(path: Path) -> pd.DataFrame:
+    """Columns of a CSV file as numbers or words; empty where there is no row."""
+    lines = _lines(path)
+    if len(lines) < 2:
+        return pd.DataFrame()
+    return pd.read_csv(io.StringIO("".join(lines)))
 
 
 def write_arrays(path: Path, **arrays: Any) -> None:
@@ -143,19 +173,22 @@ def write_arrays(path: Path, **arrays: Any) -> None:
     replace_file(path, buffer.getvalue())
 
 
-def _file(folder: Path, number: int) -> Path:
-    return folder / f"trajectory-{number:06}.npz"
-
-
 def _read_file(path: Path) -> Iterator[Frame]:
     try:
         with np.load(path) as arrays:
             step, time, height = arrays["step"], arrays["time"], arrays["height"]
             place, velocity = arrays["place"], arrays["velocity"]
+            turn = arrays["turn"] if "turn" in arrays else np.zeros((len(step), 0, 4))
     except (OSError, ValueError, KeyError) as error:
         raise StoreError(f"{path} is no trajectory file, or broken: {error}") from error
     for k in range(len(step)):
-        yield Frame(int(step[k]), float(time[k]), float(height[k]), place[k], velocity[k])
+        yield Frame(int(step[k]), float(time[k]), float(height[k]), place[k], velocity[k], turn[k])
+
+
+def _turns(frames: Sequence[Frame]) -> dict[str, Any]:
+    """Orientations, where there are any."""
+    turn = np.array([frame.turn for frame in frames], dtype=np.float32)
+    return {"turn": turn} if turn.size else {}
 
 
 def _lines(path: Path) -> list[str]:

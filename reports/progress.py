@@ -98,7 +98,7 @@ def _step_words(state: State, rate: float) -> str:
     measures = "".join(f", {name} {value:.3g}" for name, value in state.measures.items())
     return (
         f"{rate:.3g} steps/s, {report.contacts} contacts, {report.iterations} iterations, "
-        f"energy {report.energy.kinetic + report.energy.potential:.4g} J{measures}"
+        f"energy {report.energy.kinetic + report.energy.potential:.4g} {state.energy_unit}{measures}"
     )
 
 

@@ -6,15 +6,17 @@ Units are the grains' own: mean diameter D = 1, g = 1, mean mass 1; velocity √
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
+import numpy.typing as npt
 
 from scenarios.parameters import check_choice, check_count, check_number, check_positive
-from scenarios.patterns import height_map, measure_pattern
+from scenarios.patterns import Pattern, height_map, measure_pattern
 from scenarios.world.container import Motion, Shake, Vibration, box
 from scenarios.world.impact import Constant, Resolver, SlowingRestitution
-from scenarios.world.moving_scene import MovingScene, MovingWorld, never
+from scenarios.world.moving_scene import MovingScene, MovingWorld, Units, never
 from scenarios.world.spheres import Spheres, spheres
 from scenarios.world.stepping import Settings, World
 from solvers.solution import Floats
@@ -31,11 +33,17 @@ SPACING = 1.3
 JITTER = 0.1
 START_SPEED = 0.5
 
-LONGEST_STEP = 0.031
-"""Time step of the patterns [√(D/g)]: 200 a cycle for hexagons. A grain at 10 √(gD) moves 0.6 of its radius.
+LONGEST_STEP = 0.0155
+"""Time step of the patterns [√(D/g)]: 396 a cycle for hexagons, 557 for squares.
 
-Zhang 2015 has 0.0002 s; with grains of 0.165 mm, as in the experiments of Bizon 1998, that were 0.049.
+A layer that lands is pressed together, the more the longer the step: `tests/benchmarks/test_bench_world.py` prints the
+deepest overlap by step. Zhang 2015 has 0.0002 s; with grains of 0.165 mm, as in the experiments of Bizon 1998, that
+were 0.049.
 """
+# Cycles between two frames of a pattern, 60,000 grains each; its measures are taken every cycle.
+FRAME_CYCLES = 10
+GRAINS = Units(length="D", time="√(D/g)", speed="√(gD)", energy="mgD")
+"""D, m: mean diameter and mass of the grains."""
 
 SETTLED = 30.0
 """Time of the shake [√(D/g)]: the grains have fallen and lie."""
@@ -105,20 +113,48 @@ def extended_pattern(
         default_solver="qce-lcp-fast",
         steps_per_cycle=steps_per_cycle,
         default_steps=10 * steps_per_cycle,
-        frame_every=steps_per_cycle,
+        frame_every=FRAME_CYCLES * steps_per_cycle,
         measure=partial(pattern_measures, float(side)),
+        measure_every=steps_per_cycle,
+        color="height [D]",
+        units=GRAINS,
         reached=REACHED[pattern],
     )
 
 
 def pattern_measures(side: float, world: MovingWorld) -> dict[str, float]:
     """What the surface of a layer shows: see `scenarios.patterns`."""
-    found = measure_pattern(height_map(world.spheres.place, side), side)
+    return named_measures(measure_pattern(height_map(world.spheres.place, side), side))
+
+
+def named_measures(found: Pattern) -> dict[str, float]:
+    """Measures by their names in files and pages."""
     return {
         "wavelength [D]": found.wavelength, "share": found.share, "roughness [D]": found.roughness,
         "Q2": found.q2, "Q4": found.q4, "Q6": found.q6,
     }  # fmt: skip
 
+
+@dataclass(frozen=True)
+class Published:
+    """What a panel of Bizon 1998 shows, by the recipe of `scenarios.patterns`."""
+
+    q2: float
+    q4: float
+    q6: float
+    wavelength: float | None = None
+    """[D]; None where there is no pattern."""
+    cycles: int | None = None
+    """Cycles after which a run by the first author showed it."""
+
+
+PUBLISHED = {
+    "squares": Published(0.087, 0.833, 0.064, 33.3, 680),
+    "stripes": Published(0.851, 0.674, 0.429, 20.0, 2700),
+    "hexagons": Published(0.05, 0.30, 0.48, 25.0, 300),
+    "flat": Published(0.018, 0.165, 0.120),
+}
+"""Pattern → its panel; of hexagons there are two, with Q4 0.28 and 0.31, Q6 0.48 and 0.49."""
 
 REACHED: dict[str, Callable[[Mapping[str, float]], bool]] = {
     "squares": lambda found: found["Q4"] > 0.75 and found["Q2"] < 0.1,
@@ -181,8 +217,9 @@ def granular_shake(
         partial(_start, Shake(amplitude, duration, SETTLED), grains, side, settings),
         default_solver="qce-lcp-fast",
         default_steps=round((SETTLED + duration + AFTERWARDS) / step),
-        color="depth [m]",
+        color="depth [D]",
         color_from=SETTLED,
+        units=GRAINS,
     )
 
 
@@ -202,7 +239,7 @@ def layer_displacement(before: Floats, after: Floats, *, layers: int) -> Floats:
     # Half of a square floor lies within 1/√2 of the way from its middle to its walls.
     inner = away < away.max() / np.sqrt(2.0)
     rise = after[:, 2] - before[:, 2]
-    layer = np.argsort(np.argsort(before[:, 2], kind="stable"), kind="stable") * layers // len(before)
+    layer = layer_numbers(before, layers)
     found = np.full((layers, 2), np.nan)
     for k in range(layers):
         for column, place in enumerate((inner, ~inner)):
@@ -210,6 +247,12 @@ def layer_displacement(before: Floats, after: Floats, *, layers: int) -> Floats:
             if chosen.size:
                 found[k, column] = chosen.mean()
     return found
+
+
+def layer_numbers(before: Floats, layers: int) -> npt.NDArray[np.intp]:
+    """Layer of each grain, deepest first, when all have equally many; shape (grains,)."""
+    rank = np.argsort(np.argsort(before[:, 2], kind="stable"), kind="stable")
+    return np.asarray(rank * layers // len(rank))
 
 
 def _start(

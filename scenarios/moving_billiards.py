@@ -11,7 +11,7 @@ from scenarios.parameters import check_choice, check_number
 from scenarios.world.container import Container, drum
 from scenarios.world.events import EventWorld, FreeFlight
 from scenarios.world.impact import Resolver
-from scenarios.world.moving_scene import MovingScene
+from scenarios.world.moving_scene import MovingScene, MovingWorld
 from scenarios.world.spheres import Spheres, spheres
 from solvers.solution import Floats
 
@@ -25,6 +25,15 @@ STARTS = {
 In this order the sums of mirror images are formed alike, so that rounding itself is symmetric: a billiard of balls
 multiplies any difference by a factor at each impact, and 1e-16 would be everything after some hundred of them.
 """
+
+
+ASYMMETRY = "asymmetry [radii]"
+"""Measure: largest distance of a ball from where symmetry would have it."""
+# Time that the balls of a broken rack fly on, and between two frames [s].
+AFTERWARDS = 10.0
+FRAME_TIME = 0.1
+# Share of the cue ball's speed above which a ball is said to move.
+MOVING_SHARE = 0.01
 
 
 def four_balls_in_motion(*, start: str = "top", restitution: float = 1.0) -> MovingScene:
@@ -50,6 +59,11 @@ def four_balls_in_motion(*, start: str = "top", restitution: float = 1.0) -> Mov
         "Smith 2012, released scenes; Zhang 2015, Fig. 7",
         partial(_four_balls, start, restitution),
         default_solver="qce",
+        default_steps=10_000,
+        frame_time=0.5,
+        measure=partial(circle_measures, start),
+        judged={"SYM": ASYMMETRY},
+        trace="xy",
     )
 
 
@@ -57,6 +71,11 @@ def _four_balls(start: str, restitution: float, identity: str, resolver: Resolve
     ring = np.sqrt(2.0) * np.array([[0.0, 1.0], [0.0, -1.0], [-1.0, 0.0], [1.0, 0.0]])
     balls = _on_table(ring, np.array(STARTS[start]), 1.0)
     return EventWorld(identity, FreeFlight(balls, drum(DRUM_RADIUS)), resolver, restitution=restitution)
+
+
+def circle_measures(start: str, world: MovingWorld) -> dict[str, float]:
+    """How far four balls are from symmetric."""
+    return {ASYMMETRY: asymmetry(world.spheres, start)}
 
 
 def asymmetry(balls: Spheres, start: str) -> float:
@@ -75,6 +94,14 @@ def asymmetry(balls: Spheres, start: str) -> float:
         return float(np.abs(x - mirrored).max())
     turned = np.array([x[0], -x[1], (x[2, 1], -x[2, 0]), (-x[3, 1], x[3, 0])])
     return float(np.abs(turned - turned[0]).max())
+
+
+def rack_measures(world: MovingWorld) -> dict[str, float]:
+    """How far a rack is from its mirror image about the x axis, and how many of its balls move."""
+    x = world.spheres.position
+    distance = np.linalg.norm(x[:, None] - x * (1.0, -1.0, 1.0), axis=2).min(axis=1)
+    speed = np.linalg.norm(world.spheres.velocity, axis=1)
+    return {ASYMMETRY: float(distance.max() / RADIUS), "balls that move": float((speed > MOVING_SHARE).sum())}
 
 
 def pool_break_in_motion(
@@ -117,6 +144,12 @@ def pool_break_in_motion(
         impact.source,
         partial(_pool_break, impact.positions - approach * velocity, velocity, restitution, friction),
         default_solver="qce" if restitution == 1.0 and friction == 0.0 else "qce-lcp",
+        frame_time=FRAME_TIME,
+        duration=approach + AFTERWARDS,
+        measure=rack_measures,
+        judged={"SYM": ASYMMETRY},
+        color="speed [m/s]",
+        trace="xy",
     )
 
 

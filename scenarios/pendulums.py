@@ -22,7 +22,7 @@ from scenarios.world.checkpoint import Arrays
 from scenarios.world.container import Container
 from scenarios.world.events import LEFT_OVER, EventWorld
 from scenarios.world.impact import Resolver
-from scenarios.world.moving_scene import MovingScene
+from scenarios.world.moving_scene import MovingScene, MovingWorld
 from scenarios.world.spheres import Spheres, spheres
 from solvers import ImpactProblem, ProblemError, UnsupportedProblem
 from solvers.solution import Floats
@@ -36,6 +36,17 @@ DEPTH = 1e-12
 SAMPLES = 500
 # Root of the closing gap, in seconds relative to a period.
 ROOT = 1e-15
+
+SWINGS = 20
+"""Periods that a cradle is watched for."""
+# Frames a period: the turning points are among them.
+FRAMES = 40
+# A law that lets all balls creep has an impact every few milliseconds: more than this many in 20 periods end the run.
+MOST_IMPACTS = 20_000
+OPENING = "opening over ideal"
+"""Measure: gap of the contact that is open in the ideal exchange, over the ideal gap, while balls are up there."""
+# Share of the raised angle from which on a ball is up.
+OPEN = 0.5
 
 
 def cradle_3d(
@@ -70,6 +81,7 @@ def cradle_3d(
     check_positive("length", length)
     check_positive("gravity", gravity)
     check_number("restitution", restitution, low=0.0, high=1.0)
+    period = _period(angle, length, gravity)
     return MovingScene(
         "cradle-3d",
         {
@@ -84,7 +96,38 @@ def cradle_3d(
         "chosen here",
         partial(_hang, balls, raised, angle, length, gravity, restitution),
         default_solver="qce" if restitution == 1.0 else "qce-lcp",
+        default_steps=MOST_IMPACTS,
+        frame_time=period / FRAMES,
+        duration=SWINGS * period,
+        period=period,
+        measure=partial(cradle_measures, raised, angle),
+        judged={"BRK": OPENING} if restitution == 1.0 else {},
+        color="speed [m/s]",
+        trace="tx",
     )
+
+
+def cradle_measures(raised: int, angle: float, world: MovingWorld) -> dict[str, float]:
+    """A cradle beside the ideal exchange, in which the raised balls and as many at the other end swing in turn."""
+    assert isinstance(world, EventWorld)
+    flight = world.flight
+    assert isinstance(flight, Pendulums)
+    ideal = flight.ideal(raised, angle, world.time)
+    # The contact that is open in the ideal: before the last balls that fly, or behind the first.
+    open_contact = flight.angle.size - raised - 1 if ideal[-1] > 0.0 else raised - 1
+    gap, wanted = flight.gaps(flight.angle)[open_contact], flight.gaps(ideal)[open_contact]
+    far = np.abs(ideal).max() >= OPEN * angle
+    return {
+        "energy error": abs(sum(flight.energies()) / flight.energy_of(raised, angle) - 1.0),
+        "distance to ideal": float(np.sqrt(np.mean((flight.angle - ideal) ** 2))) / angle,
+        OPENING: float(gap / wanted) if far else np.nan,
+        "balls that fly": float((np.abs(flight.angle) >= OPEN * angle).sum()) if far else np.nan,
+    }
+
+
+def _period(angle: float, length: float, gravity: float) -> float:
+    """Of a pendulum that swings as far as an angle [s]."""
+    return float(4.0 * np.sqrt(length / gravity) * ellipk(np.sin(angle / 2.0) ** 2))
 
 
 def _hang(
@@ -99,7 +142,7 @@ def _hang(
     seed: int,
 ) -> EventWorld:
     # Without the other balls, one half swing lasts half a period: the last ball goes up while the first hangs still.
-    period = 4.0 * np.sqrt(length / gravity) * float(ellipk(np.sin(angle / 2.0) ** 2))
+    period = _period(angle, length, gravity)
     start = np.where(np.arange(balls) < raised, -angle, 0.0)
     flight = Pendulums(start, length=length, gravity=gravity, period=period)
     return EventWorld(identity, flight, resolver, restitution=restitution, period=period)
@@ -180,6 +223,27 @@ class Pendulums:
         values = np.column_stack([on_first, on_second]).ravel()
         J = sp.csr_array((values, (rows, columns)), shape=(first.size, self.angle.size))
         return ImpactProblem(np.ones(self.angle.size), J, self.velocity, restitution)
+
+    def ideal(self, raised: int, angle: float, time: float) -> Floats:
+        """Angles in the ideal exchange after a time [s], shape (balls,)."""
+        alone = Pendulums(np.array([-angle]), length=self.length, gravity=self.gravity, period=1.0)
+        alone.advance(time)
+        (swing,) = alone.angle
+        ideal = np.zeros_like(self.angle)
+        if swing < 0.0:
+            ideal[:raised] = swing
+        else:
+            ideal[-raised:] = swing
+        return ideal
+
+    def energy_of(self, raised: int, angle: float) -> float:
+        """Energy of so many balls at rest at an angle [J]."""
+        return float(raised * self.gravity * 2.0 * self.length * np.sin(angle / 2.0) ** 2)
+
+    def gaps(self, angle: Floats) -> Floats:
+        """Gap between neighbors at some angles [m], shape (balls - 1,)."""
+        x, _, z = self._centers(angle)
+        return np.asarray(np.hypot(np.diff(x), np.diff(z)) - 2.0 * RADIUS)
 
     def take(self, v_post: Floats) -> None:
         """Go on with the velocity after an impact, shape (balls,)."""

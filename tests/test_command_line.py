@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import csv
+import importlib.util
 import io
 import json
 import os
+import re
+import shlex
 import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
+import pandas as pd
 import pytest
 from click.testing import CliRunner, Result
 
@@ -21,7 +26,10 @@ from scenarios import CATALOG
 from solvers import SOLVERS
 
 ROOT = Path(__file__).parent.parent
-COMMANDS = ("accept", "bench", "check", "claims", "export", "figures", "list", "replay", "run", "scorecard", "simulate")
+COMMANDS = (
+    "accept", "bench", "check", "claims", "export", "figures", "list", "patterns", "replay", "run", "scorecard",
+    "simulate",
+)  # fmt: skip
 # Modules that `--help` must not wait for: each takes a tenth of a second or more.
 HEAVY = ("numpy", "scipy", "numba", "pandas", "matplotlib", "rich", "pebble")
 
@@ -88,6 +96,19 @@ def test_help_documents_the_exit_codes(command: str) -> None:
     output = call(*[word for word in (command, "--help") if word]).output
     for code in ("  0  ", "  1  ", "  2  ", "  130  "):
         assert code in output
+
+
+def test_every_command_and_option_of_the_readme_exists() -> None:
+    blocks = re.findall(
+        r"^```sh$(.*?)^```$", (ROOT / "README.md").read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL
+    )
+    lines = re.findall(r"^impactbench (.+)$", "\n".join(blocks), re.MULTILINE)
+    assert len(lines) > 10
+    for line in lines:
+        name, *words = shlex.split(line, comments=True)
+        known = {option for parameter in impactbench.main.commands[name].params for option in parameter.opts}
+        known |= {option for parameter in impactbench.main.commands[name].params for option in parameter.secondary_opts}
+        assert {word for word in words if word.startswith("--")} <= known, line
 
 
 def test_help_waits_for_no_heavy_module() -> None:
@@ -286,6 +307,35 @@ def test_export_writes_json_that_every_reader_takes(measured: Path, tmp_path: Pa
     records = json.loads(target.read_text(encoding="utf-8"), parse_constant=refuse_constant)
     with Store.open(measured / "results") as store:
         assert len(records) == len(store.frame(table)) > 0
+
+
+def test_export_writes_parquet_with_the_same_numbers(measured: Path) -> None:
+    pytest.importorskip("pyarrow", reason="Parquet is an extra")
+    to = measured / "scores.parquet"
+    asked = ("export", "--out", str(measured / "results"), "--format", "parquet")
+    done = call(*asked, "--table", "scores", "--to", str(to))
+    assert done.exit_code == 0, done.output
+    with Store.open(measured / "results") as store:
+        scores = store.frame("scores")
+    read = pd.read_parquet(to)
+    assert list(read.columns) == list(scores.columns)
+    for column in ("score", "task", "value", "tolerance", "margin"):
+        np.testing.assert_array_equal(read[column], scores[column])
+    assert [json.loads(text) for text in read["detail"]] == list(scores["detail"])
+    nowhere = measured / "nowhere" / "scores.parquet"
+    refused = call(*asked, "--to", str(nowhere))
+    assert refused.exit_code == 2
+    assert f"cannot write {nowhere}" in " ".join(refused.output.split())
+
+
+def test_parquet_without_its_package_or_a_file_is_refused(measured: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = ("export", "--out", str(measured / "results"), "--format", "parquet")
+    assert "name a file with --to" in call(*asked).output
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    refused = call(*asked, "--to", str(measured / "x.parquet"))
+    assert refused.exit_code == 2
+    assert "Parquet needs pyarrow" in refused.output
+    assert not (measured / "x.parquet").exists()
 
 
 def test_export_to_a_place_that_cannot_be_written_exits_with_2(measured: Path) -> None:

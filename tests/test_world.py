@@ -11,7 +11,7 @@ import pytest
 
 from scenarios.granular import falling_gas
 from scenarios.moving import MOVING
-from scenarios.world.checkpoint import CheckpointError, checkpoint, resume
+from scenarios.world.checkpoint import FORMAT, CheckpointError, checkpoint, resume
 from scenarios.world.container import Container, Shake, Still, Vibration, box, drum
 from scenarios.world.grid import STRIPES, Contacts, find_contacts
 from scenarios.world.impact import ByProblem, Constant, Impact, Resolver, SlowingRestitution, Streamed
@@ -20,8 +20,10 @@ from scenarios.world.spheres import Spheres, spheres
 from scenarios.world.stepping import Settings, StepReport, World
 from scenarios.world.warm_start import NO_IMPULSES, LastImpulses
 from solvers import SOLVERS, ProblemError, Status, UnsupportedProblem
+from solvers.buffers import Buffers
 from solvers.qce_lcp import QceLcp
 from solvers.solution import Floats
+from solvers.spinning_spheres import SpinningRows, sweep_spheres
 
 # Two summation orders of the same numbers.
 ROUNDING = 1e-12
@@ -245,6 +247,96 @@ def test_what_lies_starts_from_the_last_step() -> None:
     assert weights.max() == pytest.approx(8 * 0.01, rel=1e-3)
 
 
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("friction", [0.0, 0.5])
+def test_sweeps_that_end_early_gain_no_energy_and_lose_no_momentum(seed: int, friction: float) -> None:
+    # Spheres in a heap, and a first guess that pushes them apart much harder than they approach.
+    random = np.random.default_rng(seed)
+    heap = gas(120, seed)
+    heap.place[:, :3] *= 0.7
+    heap.motion[:-1, :3] = random.standard_normal((120, 3))
+    contacts = find_contacts(heap.place, Container())
+    assert contacts.m > 80
+    start = np.zeros((contacts.m, 3))
+    start[:, 0] = random.exponential(20.0, contacts.m)
+    before, mass = heap.kinetic_energy(), 1.0 / heap.inverse_mass
+    momentum = mass @ heap.velocity
+    result = sweep_spheres(
+        SpinningRows(contacts.normal, contacts.body, heap.motion, contacts.stripe), np.zeros(contacts.m), start,
+        friction=friction, inertia=2.5, tolerance=0.0, max_sweeps=1,
+    )  # fmt: skip
+    assert 0.0 <= result.share < 1.0
+    assert heap.kinetic_energy() <= before * (1.0 + ROUNDING)
+    assert np.abs(mass @ heap.velocity - momentum).max() <= ROUNDING * mass.sum()
+    push, rub = result.impulse[:, 0], result.impulse[:, 1:]
+    assert (push >= 0.0).all()
+    assert (np.abs(rub) <= friction * push[:, None] + ROUNDING).all()
+
+
+def test_an_answer_that_gains_nothing_is_left_alone() -> None:
+    # Two spheres that meet head on without restitution: one sweep is exact.
+    pair = spheres([[0.0, 0.0, 5.0], [1.0, 0.0, 5.0]], 0.5, 1.0, [[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])
+    contacts = find_contacts(pair.place, Container())
+    rows = SpinningRows(contacts.normal, contacts.body, pair.motion, contacts.stripe)
+    result = sweep_spheres(
+        rows, np.zeros(1), np.zeros((1, 3)), friction=0.5, inertia=2.5, tolerance=1e-12, max_sweeps=5
+    )
+    assert result.share == 1.0
+    assert result.impulse.tolist() == [[1.0, 0.0, 0.0]]
+
+
+def test_no_impact_of_a_layer_gains_energy_and_what_has_settled_rests() -> None:
+    world = MOVING["granular-shake"](grains=120, side=4).world()
+    assert isinstance(world, World)
+    gained = []
+    for report in run(world, world_steps := 1700):
+        work = report.energy.impact + report.energy.friction
+        gained.append(work / (report.energy.kinetic - work))
+        if report.step == SETTLED_STEPS:
+            fallen = (
+                0.5 * (1.0 / world.spheres.inverse_mass).sum() * (world.settings.gravity * world.settings.step) ** 2
+            )
+            # A grain at rest has less than what gravity gives it in a step, which the contacts take away.
+            assert report.energy.kinetic < fallen
+    assert len(gained) == world_steps
+    assert max(gained) <= ROUNDING
+
+
+# The scene's grains lie before its shake begins at step 1,500, and fly after it.
+SETTLED_STEPS = 1499
+
+
+def test_memory_is_used_again_and_grows() -> None:
+    buffers = Buffers()
+    first = buffers.array("a", (10, 3))
+    assert first.shape == (10, 3)
+    assert np.shares_memory(first, buffers.array("a", (4, 2)))
+    assert not np.shares_memory(first, buffers.array("b", (4, 2)))
+    large = buffers.array("a", (1_000_000,))
+    assert large.size == 1_000_000
+    assert not np.shares_memory(first, large)
+    assert buffers.array("c", (5,), np.uint32).dtype == np.uint32
+
+
+def test_contacts_without_memory_of_their_own_are_the_same() -> None:
+    place, walls, buffers = gas().place, box(5.0, 5.0, Still()), Buffers()
+    place[:, 3] *= 1.6
+    for _ in range(2):
+        kept, fresh = find_contacts(place, walls, buffers=buffers), find_contacts(place, walls)
+        assert kept.m == fresh.m > 100
+        for name in ("normal", "body", "gap", "stripe", "order"):
+            assert np.array_equal(getattr(kept, name), getattr(fresh, name)), name
+        place = place[::2].copy()
+        place[:, 3] *= 1.3
+
+
+@pytest.mark.kernels
+def test_spheres_in_one_place_are_refused() -> None:
+    place = np.tile([[1.0, 1.0, 1.0, 0.5]], (60, 1))
+    with pytest.raises(ProblemError, match="more than 16 contacts a sphere"):
+        find_contacts(place, Container())
+
+
 def small_pattern(seed: int = 3) -> World:
     world = MOVING["extended-pattern"](side=6, steps_per_cycle=200).world(seed=seed)
     assert isinstance(world, World)
@@ -287,8 +379,8 @@ def test_a_checkpoint_of_another_scene_or_format_is_refused(monkeypatch: pytest.
         resume(small_pattern(), b"something else")
     with pytest.raises(CheckpointError, match="not a checkpoint"):
         resume(small_pattern(), content[: len(content) // 2])
-    monkeypatch.setattr("scenarios.world.checkpoint.FORMAT", 2)
-    with pytest.raises(CheckpointError, match="format 1; this version reads format 2"):
+    monkeypatch.setattr("scenarios.world.checkpoint.FORMAT", FORMAT + 1)
+    with pytest.raises(CheckpointError, match=f"format {FORMAT}; this version reads format {FORMAT + 1}"):
         resume(small_pattern(), content)
 
 

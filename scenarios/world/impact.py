@@ -8,7 +8,7 @@ into QCE and the LCP with friction (`Streamed`): no sparse matrix, no copy of th
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Protocol
 
@@ -21,6 +21,7 @@ from scenarios.world.spheres import INVERSE_INERTIA, Ints
 from scenarios.world.warm_start import NO_IMPULSES, LastImpulses, labels_of
 from solvers import ImpactProblem, Solver, Status
 from solvers._jit import kernel
+from solvers.buffers import Buffers
 from solvers.qce_stream import solve_spheres
 from solvers.solution import Floats
 from solvers.sphere_rows import SphereRows
@@ -80,11 +81,15 @@ class Impact:
     """As `Spheres.label`, shape (bodies,)."""
     last: LastImpulses = NO_IMPULSES
     """Impulses of the step before."""
+    buffers: Buffers = field(default_factory=Buffers)
+    """Memory for what is formed of the contacts: one impact of its owner at a time."""
 
     @cached_property
     def u_pre(self) -> Floats:
         """Normal relative velocity before the impact [m/s], shape (m,)."""
-        return _relative_velocity(self.contacts.normal, self.contacts.body, self.motion)
+        u = self.buffers.array("u_pre", (self.contacts.m,))
+        _relative_velocity(self.contacts.normal, self.contacts.body, self.motion, u)
+        return u
 
     def problem(self) -> ImpactProblem:
         """The impact for any solver: blocks v of three a sphere, with friction blocks (v, s) of six."""
@@ -191,67 +196,69 @@ class Streamed:
 
     def resolve(self, impact: Impact) -> Outcome:
         """Solve one impact; `impact.motion` becomes the velocities after it."""
-        contacts = impact.contacts
-        pair = labels_of(contacts, impact.label)
+        contacts, buffers = impact.contacts, impact.buffers
         speed = float(np.abs(impact.u_pre).max(initial=0.0))
         restitution = impact.restitution.of(np.maximum(-impact.u_pre, 0.0))
+        start = buffers.array("start", (contacts.m, 3))
+        # What lies: its impulses are those of the step before.
+        lies = restitution == 0.0
+        pair = labels_of(contacts, impact.label) if lies.any() else None
+        start[:] = 0.0 if pair is None else impact.last.at(pair)
+        prediction = _NO_PREDICTION
         if restitution.any():
             prediction = self._predict(impact, restitution, speed)
-        else:
-            # What lies: its impulses are those of the step before. QCE has no part in an inelastic impact.
-            prediction = _Prediction(np.zeros(contacts.m), impact.last.at(pair), 0, Status.CONVERGED)
+            # Exact for one contact without friction.
+            elastic = 0.5 * (1.0 + restitution) * prediction.impulse
+            np.copyto(start[:, 0], elastic, where=~lies)
+            start[~lies, 1:] = 0.0
         result = sweep_spheres(
             SpinningRows(contacts.normal, contacts.body, impact.motion, contacts.stripe),
-            prediction.target, prediction.start, friction=impact.friction, inertia=INVERSE_INERTIA,
-            tolerance=self.tolerance * speed, max_sweeps=self.max_sweeps,
+            restitution * prediction.u, start, friction=impact.friction, inertia=INVERSE_INERTIA,
+            tolerance=self.tolerance * speed, max_sweeps=self.max_sweeps, buffers=buffers,
         )  # fmt: skip
         residual = result.residual / (speed or 1.0)
         status = prediction.status
         if status is Status.CONVERGED and residual > self.tolerance:
             status = Status.ITERATION_LIMIT
-        impulses = LastImpulses(pair, result.impulse)
+        impulses = NO_IMPULSES if pair is None else LastImpulses(pair, result.impulse)
         return Outcome(status, prediction.iterations, result.sweeps, residual, result.normal_work, impulses)
 
     def _predict(self, impact: Impact, restitution: Floats, speed: float) -> _Prediction:
-        """Target and first guess of the LCP from QCE's outcome."""
-        contacts = impact.contacts
+        """QCE's answer. It has no part in an inelastic impact."""
+        contacts, buffers = impact.contacts, impact.buffers
         threshold = self.qce_tolerance * speed
-        rows = SphereRows(contacts.normal, contacts.body, impact.motion[:, :4].copy(), _NO_CONTACTS)
-        elastic, iterations, _, flag = solve_spheres(
+        V = buffers.array("V", (len(impact.motion), 4))
+        V[:] = impact.motion[:, :4]
+        rows = SphereRows(contacts.normal, contacts.body, V, _NO_CONTACTS, strip=contacts.stripe)
+        impulse, iterations, _, flag = solve_spheres(
             rows, threshold=threshold, defer=0.0, max_iterations=self.max_iterations
         )
-        u_elastic = _relative_velocity(contacts.normal, contacts.body, rows.V)
-        start = np.zeros((contacts.m, 3))
-        # Exact for one contact without friction.
-        start[:, 0] = 0.5 * (1.0 + restitution) * elastic
-        if flag:
-            status = Status.STALLED
-        else:
-            status = Status.ITERATION_LIMIT if u_elastic.min(initial=0.0) < -threshold else Status.CONVERGED
-        return _Prediction(restitution * u_elastic, start, iterations, status)
+        u = buffers.array("u elastic", (contacts.m,))
+        _relative_velocity(contacts.normal, contacts.body, V, u)
+        status = Status.ITERATION_LIMIT if u.min(initial=0.0) < -threshold else Status.CONVERGED
+        return _Prediction(impulse, u, iterations, Status.STALLED if flag else status)
 
 
 @dataclass(frozen=True)
 class _Prediction:
-    """What the LCP is given."""
+    """What QCE makes of an impact."""
 
-    target: Floats
-    """Normal relative velocity to reach at least [m/s], shape (m,)."""
-    start: Floats
-    """First guess of λ, λ₁ and λ₂ [N s], shape (m, 3)."""
+    impulse: Floats | float
+    """[N s], shape (m,)."""
+    u: Floats | float
+    """Normal relative velocity after it [m/s], shape (m,)."""
     iterations: int
-    """Outer iterations of QCE."""
+    """Outer iterations."""
     status: Status
-    """What QCE came to."""
 
 
+_NO_PREDICTION = _Prediction(0.0, 0.0, 0, Status.CONVERGED)
 _NO_CONTACTS = np.zeros(0, dtype=np.int32)
 
 
 @kernel
-def _relative_velocity(normal: Floats, body: Indices, motion: Floats) -> Floats:
+def _relative_velocity(normal: Floats, body: Indices, motion: Floats, u: Floats) -> None:
     """Normal relative velocity of each contact."""
-    u = np.empty(normal.shape[0])
     for i in range(normal.shape[0]):
         a = body[i, 0]
         b = body[i, 1]
@@ -260,4 +267,3 @@ def _relative_velocity(normal: Floats, body: Indices, motion: Floats) -> Floats:
             + normal[i, 1] * (motion[b, 1] - motion[a, 1])
             + normal[i, 2] * (motion[b, 2] - motion[a, 2])
         )
-    return u

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import ast
+import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol, TypeAlias
 
 from scenarios.parameters import check_count
@@ -22,7 +24,7 @@ STREAMED: dict[str, Streamed] = {
 
 
 class MovingWorld(Protocol):
-    """A scene in motion: `World` with a fixed step, `EventWorld` from impact to impact."""
+    """A scene in motion: `World` and `RigidWorld` with a fixed step, `EventWorld` from impact to impact."""
 
     steps: int
     """Steps made."""
@@ -44,7 +46,7 @@ class MovingWorld(Protocol):
 
     @property
     def spheres(self) -> Spheres:
-        """Where the bodies are and how they move."""
+        """Where the bodies are and how they move; of a body of another shape, the sphere around it."""
         ...
 
     @property
@@ -74,7 +76,23 @@ class MovingWorld(Protocol):
         ...
 
 
+@dataclass(frozen=True)
+class Units:
+    """What lengths, times, speeds and energies of a scene are given in."""
+
+    length: str = "m"
+    time: str = "s"
+    speed: str = "m/s"
+    energy: str = "J"
+
+
+SI = Units()
+
 Start: TypeAlias = Callable[[str, Resolver, int], MovingWorld]
+
+
+STAGES_FIRED = "stages that fired"
+"""Name of the measure that counts the stages of a scene that has some."""
 
 
 def nothing_measured(world: MovingWorld) -> Mapping[str, float]:
@@ -118,17 +136,42 @@ class MovingScene:
     frame_every: int = 20
     """Steps between two frames of its trajectory, unless told."""
 
+    frame_time: float = math.inf
+    """Time between two frames of a scene that goes from impact to impact; inf where steps are of equal length."""
+
+    duration: float = math.inf
+    """Time at which the scene has shown what it is for; a run ends there unless told, or after its steps."""
+
+    period: float = math.inf
+    """Time after which an ideal scene without a step of its own repeats; inf where it does not."""
+
     measure: Callable[[MovingWorld], Mapping[str, float]] = nothing_measured
-    """What the scene is judged by, measured at every frame: name with unit → number, the same names always."""
+    """What the scene is judged by: name with unit → number, the same names always."""
+
+    measure_every: int = 0
+    """Steps between two measures; 0: at every frame."""
+
+    judged: Mapping[str, str] = field(default_factory=dict)
+    """Desideratum → the measure that shows it over a run: "SYM", how far from symmetric (≥ 0), and "BRK", how far apart
+    what should part, over the ideal (NaN at times when nothing should be apart)."""
+
+    stages: tuple[str, ...] = ()
+    """What is to happen, in this order; the measure `STAGES_FIRED` counts what did."""
 
     reached: Callable[[Mapping[str, float]], bool] = never
     """Whether its measures show what the scene is for: a pattern that stands."""
 
     color: str = "height [m]"
-    """What pictures show by color: "height [m]", "depth [m]" or "speed [m/s]"."""
+    """What pictures show by color: "height", "depth" or "speed", with its unit; or "kind", of rigid bodies."""
 
     color_from: float = 0.0
-    """Time from which the depth is taken for good [s]: when a layer has come to rest."""
+    """Time from which the depth is taken for good: when a layer has come to rest."""
+
+    trace: str = ""
+    """What a figure shows of each body: "xy", its path from above; "tx", its x over time; "" where there are many."""
+
+    units: Units = SI
+    """Of all its numbers, those of its measures too; docstrings name SI."""
 
     @property
     def label(self) -> str:
@@ -139,7 +182,8 @@ class MovingScene:
         """Start the scene.
 
         Args:
-            solver: a name in `SOLVERS` or `STREAMED`, or a solver with settings of its own; `default_solver` if None.
+            solver: a name in `STREAMED` or `SOLVERS`, the latter with numbers for settings if wanted
+                ("qce-lcp:tolerance=1e-6"), or a solver; `default_solver` if None.
             seed: of all that is random in the scene, ≥ 0.
 
         Raises:
@@ -157,6 +201,16 @@ def _resolver(solver: str | Solver | Streamed) -> Resolver:
         return ByProblem(solver)
     if solver in STREAMED:
         return STREAMED[solver]
-    if solver in SOLVERS:
-        return ByProblem(SOLVERS[solver]())
+    name, _, settings = solver.partition(":")
+    if name in SOLVERS:
+        return ByProblem(_with_settings(SOLVERS[name], settings))
     raise ProblemError(f"solver must be one of {', '.join(sorted([*SOLVERS, *STREAMED]))}, not {solver!r}")
+
+
+def _with_settings(law: Callable[..., Solver], settings: str) -> Solver:
+    """A solver with numbers for some of its settings: "tolerance=1e-6,max_sweeps=500"."""
+    pairs = (pair.partition("=") for pair in settings.split(",") if pair)
+    try:
+        return law(**{name: ast.literal_eval(value) for name, _, value in pairs})
+    except (SyntaxError, TypeError, ValueError) as error:
+        raise ProblemError(f"solver must have settings such as tolerance=1e-6, not {settings!r}: {error}") from error

@@ -32,7 +32,8 @@ from scenarios.world.impact import Impact, Resolver, Restitution
 from scenarios.world.spheres import INVERSE_INERTIA, Spheres
 from scenarios.world.warm_start import NO_IMPULSES, LastImpulses
 from solvers import ImpactProblem, ProblemError, Status
-from solvers._jit import kernel
+from solvers._jit import kernel, parallel_kernel, prange
+from solvers.buffers import Buffers
 from solvers.solution import Floats
 
 # A scene may start with spheres that overlap by this share of the smallest radius: rounding, or a layer made before.
@@ -43,6 +44,9 @@ CORRECTION_SWEEPS = 3
 RENUMBERED = 8_000
 # Steps between two renumberings: a sphere moves about a diameter meanwhile.
 RENUMBER_EVERY = 32
+# Parts of a loop over the spheres: enough for the threads of a desktop machine. A sum is one of sums of parts, so that
+# it is the same on any number of threads.
+PARTS = 16
 # Entries of `_sums`.
 KINETIC, MOMENTUM, MASS, FASTEST = range(4)
 
@@ -128,6 +132,7 @@ class World:
 
     def __post_init__(self) -> None:
         self._last = NO_IMPULSES
+        self._buffers = Buffers()
         self._spare_motion, self._spare_place = np.empty_like(self.spheres.motion), np.empty_like(self.spheres.place)
         self._smallest = float(self.spheres.radius.min())
         self._sums = _sums(self.spheres.motion)
@@ -191,7 +196,7 @@ class World:
             ProblemError: a sphere moves too far in the step, or is lost.
             UnsupportedProblem: the solver refuses the impact.
         """
-        impact = self._impact(self._spare_motion, self._spare_place)
+        impact = self._impact(self._spare_motion, self._spare_place, self._buffers)
         contacts, motion = impact.contacts, impact.motion
         u_pre = impact.u_pre
         outcome = self.resolver.resolve(impact)
@@ -228,15 +233,17 @@ class World:
 
     def impact(self) -> Impact:
         """The next step's impact: velocities after gravity and shaking, contacts where these would lead."""
-        return self._impact(np.empty_like(self.spheres.motion), np.empty_like(self.spheres.place))
+        return self._impact(np.empty_like(self.spheres.motion), np.empty_like(self.spheres.place), Buffers())
 
-    def _impact(self, motion: Floats, ahead: Floats) -> Impact:
-        """The next step's impact, in arrays that are there: fresh memory would cost more than what is written to it."""
+    def _impact(self, motion: Floats, ahead: Floats, buffers: Buffers) -> Impact:
+        """The next step's impact, in memory that is there."""
         settings = self.settings
         fall = settings.gravity * settings.step + self._kick()
         _fall(self.spheres.place, self.spheres.motion, fall, settings.step, motion, ahead)
-        contacts = find_contacts(ahead, self.container)
-        return Impact(contacts, motion, settings.restitution, settings.friction, self.spheres.label, self._last)
+        contacts = find_contacts(ahead, self.container, buffers=buffers)
+        return Impact(
+            contacts, motion, settings.restitution, settings.friction, self.spheres.label, self._last, buffers
+        )
 
     def _check_move(self, fastest: float) -> None:
         move = fastest * self.settings.step
@@ -277,18 +284,19 @@ def _pair(body: Indices, spheres: int) -> str:
     return f"sphere {body[1]} and a wall" if body[0] == spheres else f"spheres {body[0]} and {body[1]}"
 
 
-@kernel
+@parallel_kernel
 def _fall(place: Floats, motion: Floats, fall: float, step: float, after: Floats, ahead: Floats) -> None:
     """Velocities after gravity and shaking, and the places to which they lead."""
     bodies = place.shape[0]
-    for b in range(bodies + 1):
-        for column in range(8):
-            after[b, column] = motion[b, column]
-    for b in range(bodies):
-        after[b, 2] -= fall
-        for axis in range(3):
-            ahead[b, axis] = place[b, axis] + step * after[b, axis]
-        ahead[b, 3] = place[b, 3]
+    for part in prange(PARTS):
+        for b in range(bodies * part // PARTS, bodies * (part + 1) // PARTS):
+            for column in range(8):
+                after[b, column] = motion[b, column]
+            after[b, 2] -= fall
+            for axis in range(3):
+                ahead[b, axis] = place[b, axis] + step * after[b, axis]
+            ahead[b, 3] = place[b, 3]
+    after[bodies] = motion[bodies]
 
 
 @kernel
@@ -341,34 +349,42 @@ def _push_apart(
     return shift, deepest
 
 
-@kernel
+@parallel_kernel
 def _move(place: Floats, motion: Floats, step: float, shift: Floats) -> tuple[float, float]:
     """New places; returns Σ m z of them, and Σ m Δz of the shift alone."""
-    height = 0.0
-    lifted = 0.0
-    for b in range(place.shape[0]):
-        mass = 1.0 / motion[b, 3]
-        for axis in range(3):
-            place[b, axis] += step * motion[b, axis] + shift[b, axis]
-        height += mass * place[b, 2]
-        lifted += mass * shift[b, 2]
-    return height, lifted
+    bodies = place.shape[0]
+    height = np.zeros(PARTS)
+    lifted = np.zeros(PARTS)
+    for part in prange(PARTS):
+        for b in range(bodies * part // PARTS, bodies * (part + 1) // PARTS):
+            mass = 1.0 / motion[b, 3]
+            for axis in range(3):
+                place[b, axis] += step * motion[b, axis] + shift[b, axis]
+            height[part] += mass * place[b, 2]
+            lifted[part] += mass * shift[b, 2]
+    return height.sum(), lifted.sum()
 
 
-@kernel
+@parallel_kernel
 def _sums(motion: Floats) -> Floats:
     """Kinetic energy, vertical momentum, mass, largest speed squared (NaN where any is)."""
-    kinetic = 0.0
-    momentum = 0.0
-    total = 0.0
-    fastest = 0.0
-    for b in range(motion.shape[0] - 1):
-        mass = 1.0 / motion[b, 3]
-        square = motion[b, 0] ** 2 + motion[b, 1] ** 2 + motion[b, 2] ** 2
-        spin = motion[b, 4] ** 2 + motion[b, 5] ** 2 + motion[b, 6] ** 2
-        kinetic += 0.5 * mass * (square + spin / INVERSE_INERTIA)
-        momentum += mass * motion[b, 2]
-        total += mass
-        fastest = max(fastest, square)
-    # NaN is lost in a comparison, not in a sum.
-    return np.array([kinetic, momentum, total, fastest + 0.0 * kinetic])
+    bodies = motion.shape[0] - 1
+    sums = np.zeros((PARTS, 4))
+    for part in prange(PARTS):
+        kinetic = momentum = total = fastest = 0.0
+        for b in range(bodies * part // PARTS, bodies * (part + 1) // PARTS):
+            mass = 1.0 / motion[b, 3]
+            square = motion[b, 0] ** 2 + motion[b, 1] ** 2 + motion[b, 2] ** 2
+            spin = motion[b, 4] ** 2 + motion[b, 5] ** 2 + motion[b, 6] ** 2
+            kinetic += 0.5 * mass * (square + spin / INVERSE_INERTIA)
+            momentum += mass * motion[b, 2]
+            total += mass
+            fastest = max(fastest, square)
+        sums[part, KINETIC] = kinetic
+        sums[part, MOMENTUM] = momentum
+        sums[part, MASS] = total
+        # NaN is lost in a comparison, not in a sum.
+        sums[part, FASTEST] = fastest + 0.0 * kinetic
+    found: Floats = sums.sum(axis=0)
+    found[FASTEST] = sums[:, FASTEST].max()
+    return found

@@ -1,0 +1,256 @@
+"""Patterns of vibrated layers beside those of Bizon 1998, from their records alone: nothing is computed again.
+
+patterns.md                     what each run shows, cycle by cycle, and Table 2 of Zhang 2015 beside ours
+patterns.(pdf|svg|png)          last height map of each run, as Fig. 9 of Zhang 2015
+pattern_growth.(…)              five maps of each run, from its first to its last
+pattern_measures.(…)            wavelength, Q2, Q4, Q6 and roughness over the cycles
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import MaxNLocator
+
+from harness.patterns import EVERY, PatternRecord
+from reports.figures import BLACK, BLUE, GREEN, STYLE, TWO_COLUMNS, VERMILLION, save
+from reports.files import prepare, write_whole
+from reports.markdown import markdown_table
+from reports.scorecard import ReportError
+from scenarios.granular import DRIVING, PUBLISHED, REACHED, named_measures
+from scenarios.patterns import Pattern
+
+COLORS = {"squares": VERMILLION, "stripes": BLUE, "hexagons": GREEN, "flat": BLACK}
+MARKERS = {"squares": "s", "stripes": "^", "hexagons": "o", "flat": "."}
+# Width of one of four panels side by side [in].
+PANEL = TWO_COLUMNS / 4
+# Maps of a run in the figure of its growth.
+STAGES = 5
+# Heights outside these percentiles of a map are drawn as the ends of the gray scale: single grains fly high.
+SHOWN_PERCENTILES = (1.0, 99.0)
+
+# Zhang 2015, Table 2, for the patterns of 60,000 grains: iterations of QCE (mean, largest, smallest), and seconds a
+# step in contact resolving on one thread of a 3.0 GHz i5-2320 (mean, largest).
+TABLE_2 = {
+    "squares": (13, 46, 1, 0.28, 2.74),
+    "stripes": (17, 44, 1, 0.33, 4.39),
+    "hexagons": (12, 33, 1, 0.25, 2.87),
+}
+TABLE_2_NOTE = (
+    "The paper's seconds are contact resolving alone, on one thread of a 3.0 GHz i5-2320, with a step of 0.0002 s for "
+    "grains of unknown size. Ours are whole steps on the machine named below; what else ran on it, and time in which "
+    "the run was stopped, counts in the mean and the most, hardly in the median."
+)
+
+
+def write_patterns(records: Sequence[PatternRecord], folder: Path) -> list[Path]:
+    """Write the page and the figures of some runs.
+
+    Args:
+        records: one a pattern.
+        folder: where to.
+
+    Raises:
+        ReportError: there is no record, or the folder cannot be written to.
+    """
+    if not records:
+        raise ReportError(f"{folder} holds no records of patterns; name results folders of extended-pattern runs")
+    ordered = sorted(records, key=lambda record: list(DRIVING).index(record.pattern))
+    path = prepare(folder)
+    written = [write_whole(path / "patterns.md", patterns_markdown(ordered).encode())]
+    with mpl.rc_context(STYLE):
+        written += save(_panels_figure(ordered), path, "patterns")
+        written += save(_growth_figure(ordered), path, "pattern_growth")
+        written += save(_measures_figure(ordered), path, "pattern_measures")
+    return written
+
+
+def patterns_markdown(records: Sequence[PatternRecord]) -> str:
+    """All runs as one Markdown page."""
+    lines = [
+        "# Patterns of vibrated layers",
+        "",
+        f"Height maps at the beginning of every {EVERY}th cycle (plate at its middle, going up), measured as "
+        "`scenarios/patterns.py` says. Published: the panels of Bizon et al. 1998 by the same measure; \"cycles\" is "
+        "when a run of the first author showed the pattern. Lengths are in mean diameters D of a grain.",
+        "",
+        *markdown_table(
+            ("pattern", "whose", "cycles", "wavelength", "Q2", "Q4", "Q6", "roughness", "pattern stands"),
+            [row for record in records for row in _comparison_rows(record)],
+        ),
+        "",
+        "A pattern stands from the cycle on from which all later maps pass its threshold: squares Q4 > 0.75 and "
+        "Q2 < 0.1, stripes Q2 > 0.8, hexagons Q6 > 0.45 and Q2 < 0.1.",
+        "",
+        "## Beside Table 2 of Zhang 2015",
+        "",
+        TABLE_2_NOTE,
+        "",
+        *markdown_table(
+            ("pattern", "whose", "QCE iterations, mean / most / least", "seconds a step, mean / most", "median"),
+            [row for record in records for row in _table_2_rows(record)],
+        ),
+        "",
+    ]  # fmt: skip
+    for record in records:
+        lines += _run_lines(record)
+    return "\n".join(lines)
+
+
+def standing_since(record: PatternRecord) -> int | None:
+    """First stored cycle from which on every map shows the pattern; None if the last one does not."""
+    since = None
+    for cycle, found in zip(record.cycles, record.measures(), strict=True):
+        if not REACHED[record.pattern](named_measures(found)):
+            since = None
+        elif since is None:
+            since = int(cycle)
+    return since
+
+
+def _comparison_rows(record: PatternRecord) -> Iterator[tuple[str, ...]]:
+    """The last map beside the published panel."""
+    panel, found = PUBLISHED[record.pattern], record.measures()[-1]
+    if record.pattern == "flat":
+        stands = "none is expected"
+    else:
+        since = standing_since(record)
+        stands = f"from cycle {since} on" if since is not None else "no"
+    yield (
+        record.pattern, "here", str(record.cycles[-1]), f"{found.wavelength:.1f}", f"{found.q2:.3f}", f"{found.q4:.3f}",
+        f"{found.q6:.3f}", f"{found.roughness:.2f}", stands,
+    )  # fmt: skip
+    yield (
+        "", "Bizon 1998", str(panel.cycles or "–"), f"{panel.wavelength or '–'}", f"{panel.q2:.3f}", f"{panel.q4:.3f}",
+        f"{panel.q6:.3f}", "–", "",
+    )  # fmt: skip
+
+
+def _table_2_rows(record: PatternRecord) -> Iterator[tuple[str, ...]]:
+    """Statistics of all steps, beside the paper's where it has the pattern."""
+    mean, most, least = record.run["iterations"]
+    mean_s, median_s, most_s = record.run["wall_s"]
+    yield (
+        record.pattern, "here", f"{mean:.1f} / {most} / {least}", f"{mean_s:.3g} / {most_s:.3g}", f"{median_s:.3g}"
+    )  # fmt: skip
+    if record.pattern in TABLE_2:
+        mean, most, least, mean_s, most_s = TABLE_2[record.pattern]
+        yield "", "Zhang 2015", f"{mean} / {most} / {least}", f"{mean_s} / {most_s}", "–"
+
+
+def _run_lines(record: PatternRecord) -> Iterator[str]:
+    """How the run was made, how well its steps were solved, and what each map shows."""
+    run, machine = record.run, record.run["machine"]
+    yield from (
+        f"## {record.pattern.capitalize()}",
+        "",
+        f"`impactbench simulate {run['scene']} --solver {run['solver']} --seed {run['seed']} --steps {run['steps']}`, "
+        f"impactbench {machine['impactbench']} at commit {str(machine['commit'])[:10]}, Python {machine['python']}, "
+        f"numba {machine['numba']}, {machine['cpu']}, {machine['cores']} cores.",
+        "",
+        f"{run['steps']} steps, {run['steps_per_cycle']} a cycle; contacts {run['contacts'][0]:.0f} on average, "
+        f"{run['contacts'][1]} at most; {run['sweeps']:.3g} friction sweeps a step, after which "
+        f"{100 * run['converged']:.3g} % of the steps passed the law's own tolerance; deepest overlap of a step below "
+        f"{run['overlap'][0]:.2g} radii in 99 % of the steps, {run['overlap'][1]:.2g} at most.",
+        "",
+    )
+    yield from markdown_table(
+        ("cycle", "wavelength", "share", "roughness", "Q2", "Q4", "Q6", "shows the pattern"),
+        [
+            (
+                str(cycle), f"{found.wavelength:.1f}", f"{found.share:.2f}", f"{found.roughness:.2f}",
+                f"{found.q2:.3f}", f"{found.q4:.3f}", f"{found.q6:.3f}", _shown(record, found),
+            )
+            for cycle, found in zip(record.cycles, record.measures(), strict=True)
+        ],
+    )  # fmt: skip
+    yield ""
+
+
+def _shown(record: PatternRecord, found: Pattern) -> str:
+    if record.pattern == "flat":
+        return "–"
+    return "yes" if REACHED[record.pattern](named_measures(found)) else "no"
+
+
+def _draw_map(axes: Axes, record: PatternRecord, k: int) -> None:
+    """One height map from above, x to the right; high is bright."""
+    heights = record.heights[k]
+    low, high = np.nanpercentile(heights, SHOWN_PERCENTILES)
+    image = axes.imshow(
+        heights.T, origin="lower", extent=(0.0, record.side, 0.0, record.side), cmap="gray", vmin=low, vmax=high,
+        interpolation="nearest",
+    )  # fmt: skip
+    axes.grid(visible=False)
+    axes.set_xticks([])
+    axes.set_yticks([])
+    figure = axes.get_figure()
+    assert figure is not None
+    bar = figure.colorbar(image, ax=axes, location="bottom", shrink=0.8, pad=0.03, aspect=18)
+    bar.ax.xaxis.set_major_locator(MaxNLocator(4, integer=True))
+    bar.outline.set_linewidth(0.4)
+
+
+def _panels_figure(records: Sequence[PatternRecord]) -> Figure:
+    """Last map of each run."""
+    figure = Figure(figsize=(PANEL * len(records), 2.5), layout="constrained")
+    panels = figure.subplots(1, len(records), squeeze=False)[0]
+    for axes, record, letter in zip(panels, records, "abcd", strict=False):
+        _draw_map(axes, record, -1)
+        axes.set_title(f"({letter}) {record.pattern}, cycle {record.cycles[-1]}")
+    return _laid_out(figure)
+
+
+def _growth_figure(records: Sequence[PatternRecord]) -> Figure:
+    """Maps of each run at cycles that grow by a factor."""
+    columns = min(STAGES, max(len(record.cycles) for record in records))
+    figure = Figure(figsize=(TWO_COLUMNS / STAGES * columns, 1.9 * len(records) + 0.2), layout="constrained")
+    rows = figure.subplots(len(records), columns, squeeze=False)
+    for record, panels in zip(records, rows, strict=True):
+        stages = np.unique(np.geomspace(1, len(record.cycles), columns).round().astype(int)) - 1
+        for axes, k in zip(panels, stages, strict=False):
+            _draw_map(axes, record, k)
+            axes.set_title(f"cycle {record.cycles[k]}")
+        for axes in panels[len(stages) :]:
+            axes.set_visible(False)
+        panels[0].set_ylabel(record.pattern)
+    return _laid_out(figure)
+
+
+def _laid_out(figure: Figure) -> Figure:
+    """Label all gray scales at once; bars below panels need a second pass of the layout, which `save` makes."""
+    figure.supxlabel("height above the plate [D]", fontsize=STYLE["axes.labelsize"])
+    figure.draw_without_rendering()
+    return figure
+
+
+def _measures_figure(records: Sequence[PatternRecord]) -> Figure:
+    """Measures over the cycles; the published values as dashes."""
+    names = {"wavelength": "wavelength [D]", "roughness": "roughness [D]", "q2": "Q2", "q4": "Q4", "q6": "Q6"}
+    figure = Figure(figsize=(TWO_COLUMNS, 3.3), layout="constrained")
+    panels = figure.subplots(2, 3, sharex=True).ravel()
+    for axes, (name, label) in zip(panels, names.items(), strict=False):
+        for record in records:
+            values = [getattr(found, name) for found in record.measures()]
+            color, published = COLORS[record.pattern], getattr(PUBLISHED[record.pattern], name, None)
+            axes.plot(
+                record.cycles, values, color=color, marker=MARKERS[record.pattern], markersize=2.5, label=record.pattern
+            )
+            if published is not None:
+                axes.axhline(published, color=color, linestyle=(0, (4, 3)), linewidth=0.8)
+        axes.set_ylabel(label)
+        axes.set_ylim(0.0, 1.0 if name.startswith("q") else 1.1 * axes.get_ylim()[1])
+    for axes in panels[2:]:
+        axes.set_xlabel("cycle")
+    panels[2].tick_params(labelbottom=True)
+    panels[-1].set_visible(False)
+    lines, labels = panels[0].get_legend_handles_labels()
+    published = Line2D([], [], color=BLACK, linestyle=(0, (4, 3)), linewidth=0.8, label="published panel")
+    figure.legend(handles=[*lines, published], labels=[*labels, "published panel"], loc="lower right")
+    return figure
