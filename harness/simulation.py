@@ -302,7 +302,7 @@ class _Recorder:
             Frame(
                 world.steps, world.time, height,
                 world.spheres.by_label(world.spheres.place), world.spheres.by_label(world.spheres.velocity),
-                world.orientation if isinstance(world, RigidWorld) else np.zeros((0, 4)),
+                world.orientation.copy() if isinstance(world, RigidWorld) else np.zeros((0, 4)),
             )
         )  # fmt: skip
 

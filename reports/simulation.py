@@ -3,7 +3,9 @@
 simulation.md                      the six scores, the statistics of the steps, the energy ledger, the measures
 simulation_energy.(pdf|svg|png)    kinetic and potential energy, and where it went
 simulation_measures.(…)            what the scene is judged by, over time
-still-STEP.png, simulation.mp4     pictures (the video with the extra `render`)
+simulation_paths.(…)               how each body went, in scenes of few
+simulation_layers.(…)              how a layer's parts moved, in scenes that are colored by depth
+still-FRAME.png, simulation.mp4    pictures (the video with the extra `render`)
 """
 
 from __future__ import annotations
@@ -16,29 +18,34 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from harness import trajectory
-from harness.measurement import DESIDERATA, Kind, Verdict
-from harness.results import Cell, Frames, Results, ResultsError
+from harness.measurement import DESIDERATA
+from harness.results import Frames, Results
 from harness.simulation import MEASURES, RUN, STEPS
 from reports import pictures
-from reports.figures import BLACK, BLUE, GREEN, ORANGE, PURPLE, STYLE, TWO_COLUMNS, VERMILLION, save
+from reports.figures import BLACK, BLUE, GREEN, ORANGE, PURPLE, SKY, STYLE, TWO_COLUMNS, VERMILLION, save
 from reports.files import prepare, write_whole
+from reports.layers import Layers, at_or_after, layers_figure, layers_lines, read_layers
 from reports.markdown import markdown_table
+from reports.patterns import TABLE_2, TABLE_2_NOTE
+from reports.runs import measured, measures_figure, numbers, results_of, solver_of, thinned, trace_figure
 from reports.scorecard import ReportError
 from reports.wording import number
+from scenarios.world.moving_scene import STAGES_FIRED, MovingScene, Units
+from scenarios.world.rigid_world import RigidWorld
+from solvers import SOLVERS
 from solvers.solution import Floats
 
+VIEWS = {"xy": pictures.View(elevation=90.0, azimuth=-90.0), "tx": pictures.View(elevation=0.0, azimuth=-90.0)}
+"""From where a scene is seen whose bodies stay in a plane, by what its traces show."""
 STILLS = 4
 """Pictures of a run, its first and last frame among them."""
 # Frames of a video; a longer trajectory is thinned.
 MOST_FRAMES = 250
 
-# Zhang 2015, Table 2, for the patterns of 60,000 grains: iterations of QCE (mean, largest, smallest), and seconds a
-# step in contact resolving on one thread of a 3.0 GHz i5-2320 (mean, largest).
-TABLE_2 = {
-    "squares": (13, 46, 1, 0.28, 2.74),
-    "stripes": (17, 44, 1, 0.33, 4.39),
-    "hexagons": (12, 33, 1, 0.25, 2.87),
-}
+KINDS = (ORANGE, BLUE, VERMILLION, GREEN, PURPLE, SKY, BLACK)
+"""Colors of the kinds of rigid bodies, in the order in which they are named."""
+SCENERY = "lightgray"
+"""Color of what does not move."""
 
 TERMS = {
     "impact": (VERMILLION, "impact, normal"),
@@ -50,51 +57,58 @@ TERMS = {
 """Terms of the energy ledger: color and label."""
 
 
-def write_simulation(store: Frames, folder: Path) -> list[Path]:
+def write_simulation(store: Frames, folder: Path, scene: MovingScene) -> list[Path]:
     """Write the page and the figures of a simulation.
 
     Args:
         store: of the folder.
         folder: with series, measures and frames; the files go there too.
+        scene: that was run.
 
     Raises:
         ReportError: the folder holds no simulation, or cannot be written to.
     """
-    series = _numbers(folder / STEPS)
+    series = numbers(folder / STEPS)
     if not series:
         raise ReportError(f"{folder} holds no simulation; run one first: impactbench simulate")
     path = prepare(folder)
-    written = [write_whole(path / "simulation.md", simulation_markdown(store, series).encode())]
+    layers = read_layers(folder, scene)
+    page = simulation_markdown(store, series, scene, layers) + stages_markdown(scene, numbers(folder / MEASURES))
+    written = [write_whole(path / "simulation.md", page.encode())]
     with mpl.rc_context(STYLE):
-        written += save(_energy_figure(series), path, "simulation_energy")
-        measures = _numbers(folder / MEASURES)
-        if len(measures) > len(("step", "time")):
-            written += save(_measures_figure(measures), path, "simulation_measures")
+        written += save(_energy_figure(series, scene.units), path, "simulation_energy")
+        runs = {solver_of(store): folder}
+        if measured(runs):
+            written += save(measures_figure(runs, scene), path, "simulation_measures")
+        if scene.trace:
+            written += save(trace_figure(runs, scene), path, "simulation_paths")
+        if layers is not None:
+            written += save(layers_figure(layers, scene), path, "simulation_layers")
     return written
 
 
-def simulation_markdown(store: Frames, series: Mapping[str, Floats]) -> str:
+def simulation_markdown(
+    store: Frames, series: Mapping[str, Floats], scene: MovingScene, layers: Layers | None
+) -> str:  # fmt: skip
     """The whole run as one Markdown page."""
-    try:
-        results = Results(store, kinds=(Kind.SIMULATION,))
-    except ResultsError as error:
-        raise ReportError(str(error)) from error
+    results = results_of(store)
     (solver,) = results.solvers
     # A run that was gone on with has one for each of its ends: the last one is the whole.
     runs = [task for task in results.tasks if task.parameters["of"] == RUN][-1:]
     probes = [task for task in results.tasks if task.parameters["of"] != RUN and task.done]
-    body = [(name, *_cell_words(results.cell(solver, name))) for name in DESIDERATA]
+    body = [(name, *_cell_words(results, solver, name)) for name in DESIDERATA]
     run_rows = [row for row in results.scores if row.task in runs]
+    units = scene.units
     lines = [
-        f"# {runs[0].label if runs else results.tasks[0].label} by {solver}",
+        f"# {scene.label} by {solver}",
         "",
-        f"{len(series['step'])} steps, {series['time'][-1]:.6g} s of simulated time, "
-        f"{series['wall_s'].sum():.3g} s of computation.",
+        f"{len(series['step'])} steps, {series['time'][-1]:.6g} {units.time} of simulated time, "
+        f"{series['wall_s'].sum():.3g} s of computation. Units: {units.length}, {units.time}, {units.energy}.",
         "",
         "## The six scores over the run",
         "",
-        f"KIN over all steps; all of them on {len(probes)} impacts of single steps, taken by themselves "
-        "(none where the scene is too large or solved without an `ImpactProblem`).",
+        f"KIN over all steps, what the scene itself measures over all of them, and all six on {len(probes)} impacts of "
+        "single steps, taken by themselves (none where the scene is too large or solved without an `ImpactProblem`).",
         "",
         *markdown_table(("score", "verdict", "worst", "of"), body),
         "",
@@ -103,6 +117,7 @@ def simulation_markdown(store: Frames, series: Mapping[str, Floats]) -> str:
         *markdown_table(("per step", "mean", "largest", "smallest"), list(_step_rows(series))),
         "",
         *_table_2(results, series),
+        *(layers_lines(layers, scene) if layers is not None else ()),
         "## Energy and what the scene is judged by",
         "",
         *markdown_table(
@@ -115,74 +130,104 @@ def simulation_markdown(store: Frames, series: Mapping[str, Floats]) -> str:
     return "\n".join(lines)
 
 
+def stages_markdown(scene: MovingScene, measures: Mapping[str, Floats]) -> str:
+    """When each stage of a scene was seen to have fired, and the first that did not; empty where it has none."""
+    if not scene.stages:
+        return ""
+    body = []
+    for k, name in enumerate(scene.stages):
+        frames = np.flatnonzero(measures[STAGES_FIRED] > k)
+        body.append((str(k + 1), name, number(float(measures["time"][frames[0]])) if frames.size else "did not fire"))
+    missing = [name for _, name, when in body if when == "did not fire"]
+    verdict = f"The chain breaks before: {missing[0]}." if missing else "All stages fired in their order."
+    table = markdown_table(("", "stage", f"by the frame at [{scene.units.time}]"), body)
+    return "\n".join(["", "## Stages", "", *table, "", verdict, ""])
+
+
 def write_pictures(
-    folder: Path,
-    *,
-    color: str,
-    color_from: float = 0.0,
-    video: bool,
-    view: pictures.View,
-    progress: Callable[[str], None],
-) -> list[Path]:
+    folder: Path, scene: MovingScene, *, video: bool, progress: Callable[[str], None]
+) -> list[Path]:  # fmt: skip
     """Draw stills of a simulation, and a video if it is wanted.
 
     Args:
         folder: with frames.
-        color: what the color shows: "height [m]", "depth [m]" or "speed [m/s]".
-        color_from: time of the frame that the depth is taken from [s]; the last frame where none is as late.
+        scene: that was run; it says what the color shows.
         video: also write simulation.mp4.
-        view: from where.
         progress: told what is drawn.
 
     Raises:
         ReportError: there is no frame, or a video is wanted without the extra `render`.
     """
-    steps = [frame.step for frame in trajectory.read_frames(folder)]
-    if not steps:
+    count = sum(1 for _ in trajectory.read_frames(folder))
+    if not count:
         raise ReportError(f"{folder} holds no frames")
-    paint = _painter(folder, color, color_from)
-    stage = pictures.stage_of((paint(frame) for frame in trajectory.read_frames(folder)), color)
-    wanted = {steps[k] for k in np.linspace(0, len(steps) - 1, STILLS).round().astype(int)}
+    paint, view = _painter(folder, scene), VIEWS.get(scene.trace, pictures.View())
+    painted = (paint(frame) for frame in trajectory.read_frames(folder))
+    solids = solids_of(scene)
+    stage = (
+        pictures.stage_of_solids(painted, scene.color, solids) if solids else pictures.stage_of(painted, scene.color)
+    )
+    wanted = set(np.linspace(0, count - 1, STILLS).round().astype(int))
     written = []
-    for frame in trajectory.read_frames(folder):
-        if frame.step in wanted:
-            path = folder / f"still-{frame.step:07}.png"
+    for k, frame in enumerate(trajectory.read_frames(folder)):
+        if k in wanted:
+            path = folder / f"still-{k:05}.png"
             written.append(pictures.write_still(path, paint(frame), stage, view))
             progress(f"drew {path.name}")
     if video:
-        every = -(-len(steps) // MOST_FRAMES)
+        every = -(-count // MOST_FRAMES)
         frames = (paint(f) for k, f in enumerate(trajectory.read_frames(folder)) if k % every == 0)
-        progress(f"drawing {-(-len(steps) // every)} frames of a video")
+        progress(f"drawing {-(-count // every)} frames of a video")
         written.append(pictures.write_video(folder / "simulation.mp4", frames, stage, view))
     return written
 
 
-def _painter(folder: Path, color: str, color_from: float) -> Callable[[trajectory.Frame], pictures.Frame]:
+def _painter(folder: Path, scene: MovingScene) -> Callable[[trajectory.Frame], pictures.Frame]:
     """Give each sphere its color, and each frame its title."""
     for frame in trajectory.read_frames(folder):
         depth = frame.place[:, 2].max() - frame.place[:, 2]
-        # Times are sums of steps.
-        if frame.time >= color_from * (1.0 - 1e-9):
+        if at_or_after(frame.time, scene.color_from):
             break
     shown: dict[str, Callable[[trajectory.Frame], Floats]] = {
-        "height [m]": lambda frame: frame.place[:, 2],
-        "depth [m]": lambda _: depth,
-        "speed [m/s]": lambda frame: np.linalg.norm(frame.velocity, axis=1),
+        pictures.KIND: lambda frame: np.zeros(len(frame.place)),
+        "height": lambda frame: frame.place[:, 2],
+        "depth": lambda _: depth,
+        "speed": lambda frame: np.linalg.norm(frame.velocity, axis=1),
     }
-    if color not in shown:
-        raise ReportError(f"color must be one of {', '.join(shown)}, not {color!r}")
+    color = shown[scene.color.partition(" ")[0]]
     return lambda frame: pictures.Frame(
-        frame.place, shown[color](frame), f"step {frame.step}, t = {frame.time:.4g} s"
+        frame.place, color(frame), f"step {frame.step}, t = {frame.time:.4g} {scene.units.time}", frame.turn
     )  # fmt: skip
 
 
-def _cell_words(cell: Cell) -> tuple[str, str, str]:
-    """Verdict, worst number and where it was measured."""
-    if cell.verdict is None or cell.worst is None:
-        return "not measured", "–", "–"
-    if cell.verdict is Verdict.NOT_APPLICABLE:
-        return "not applicable", "–", str(cell.worst.detail.get("reason", "–"))
-    return cell.verdict.value, f"{cell.worst.metric} {number(cell.worst.value)}", cell.worst.task.label
+def solids_of(scene: MovingScene) -> list[pictures.Solid]:
+    """What is drawn of a scene of rigid bodies, each kind in a color of its own; empty where all are spheres."""
+    world = scene.world(solver=SOLVERS["qce-lcp"]())
+    if not isinstance(world, RigidWorld):
+        return []
+    kinds: dict[str, str] = {}
+    solids = []
+    for name, vertices, faces, body in world.meshes():
+        # "card 7" is a card; what does not move is gray.
+        color = SCENERY
+        if body >= 0:
+            kind = name.rstrip(" 0123456789")
+            color = kinds.setdefault(kind, KINDS[len(kinds) % len(KINDS)])
+        solids.append(pictures.Solid(vertices, faces, body, color))
+    return solids
+
+
+def _cell_words(results: Results, solver: str, name: str) -> tuple[str, str, str]:
+    """Verdict, worst number and where it was measured, or why there is none."""
+    cell = results.cell(solver, name)
+    if cell.verdict is None:
+        return "not measured", "–", "no impact of the run was taken by itself"
+    if cell.worst is None:
+        reasons = dict.fromkeys(str(row.detail.get("reason", "–")) for row in results.scores_of(solver, name))
+        return "not applicable", "–", "; ".join(reasons)
+    detail = cell.worst.detail if cell.worst.task.parameters["of"] == RUN else {}
+    where = ", ".join([cell.worst.task.label, *(f"{key} {value}" for key, value in detail.items())])
+    return cell.verdict.value, f"{cell.worst.metric} {number(cell.worst.value)}", where
 
 
 def _step_rows(series: Mapping[str, Floats]) -> Iterator[tuple[str, ...]]:
@@ -211,48 +256,27 @@ def _table_2(results: Results, series: Mapping[str, Floats]) -> list[str]:
     return [
         "### Beside Table 2 of the paper",
         "",
-        "The paper's seconds are contact resolving alone on one thread of a 3.0 GHz i5-2320 with a step of 0.0002 s "
-        "for grains of unknown size; ours are whole steps on this machine.",
+        TABLE_2_NOTE,
         "",
         *markdown_table(("where", "QCE iterations, mean / most / least", "seconds a step, mean / most"), body),
         "",
     ]
 
 
-def _energy_figure(series: Mapping[str, Floats]) -> Figure:
+def _energy_figure(series: Mapping[str, Floats], units: Units) -> Figure:
     """Energy over time, and the running sum of each term of the ledger."""
     figure = Figure(figsize=(TWO_COLUMNS, 2.6), layout="constrained")
     left, right = figure.subplots(1, 2)
+    work = thinned({name: np.cumsum(series[name]) for name in TERMS})
+    series = thinned(series)
     left.plot(series["time"], series["kinetic"], color=VERMILLION, label="kinetic")
     left.plot(series["time"], series["potential"], color=BLUE, label="potential")
     left.plot(series["time"], series["kinetic"] + series["potential"], color=BLACK, linewidth=0.7, label="sum")
-    left.set_ylabel("energy [J]")
+    left.set_ylabel(f"energy [{units.energy}]")
     for name, (color, label) in TERMS.items():
-        right.plot(series["time"], np.cumsum(series[name]), color=color, label=label)
-    right.set_ylabel("work since the start [J]")
+        right.plot(series["time"], work[name], color=color, label=label)
+    right.set_ylabel(f"work since the start [{units.energy}]")
     for axes in (left, right):
-        axes.set_xlabel("time [s]")
+        axes.set_xlabel(f"time [{units.time}]")
         axes.legend()
     return figure
-
-
-def _measures_figure(measures: Mapping[str, Floats]) -> Figure:
-    """Every measure of the scene over time, a panel each."""
-    names = [name for name in measures if name not in ("step", "time")]
-    figure = Figure(figsize=(TWO_COLUMNS, 1.7 * -(-len(names) // 2)), layout="constrained")
-    panels = figure.subplots(-(-len(names) // 2), 2, squeeze=False).ravel()
-    for axes, name in zip(panels, names, strict=False):
-        axes.plot(measures["time"], measures[name], color=BLUE, marker="." if len(measures["time"]) < 60 else "")
-        axes.set_ylabel(name)
-        axes.set_xlabel("time [s]")
-    for axes in panels[len(names) :]:
-        axes.set_visible(False)
-    return figure
-
-
-def _numbers(path: Path) -> dict[str, Floats]:
-    """Columns of a CSV file as numbers; words are left out."""
-    rows = trajectory.read_rows(path)
-    return {
-        name: np.array(values, dtype=np.float64) for name, values in rows.items() if name not in ("status",)
-    }  # fmt: skip

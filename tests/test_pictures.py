@@ -1,4 +1,4 @@
-"""Pictures of spheres: what is drawn where, with and without the renderer."""
+"""Pictures of spheres and of solid bodies: what is drawn where, with and without the renderer."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from reports import pictures
-from reports.pictures import Frame, Stage, View
+from reports.pictures import KIND, Frame, Solid, Stage, View
 from reports.scorecard import ReportError
 
 VIEW = View(width=320, height=240)
@@ -59,6 +59,57 @@ def test_a_sphere_of_twice_the_radius_covers_four_times_the_area(draw: object) -
     large = pixels_like(drawn(draw, PLACE[:1], COLOR[:1]), 0)
     # Rim, perspective and shading take some of it.
     assert 3.0 < large / small < 5.0
+
+
+# A cube about its own origin: corners, and two triangles a side.
+CORNERS = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
+SIDES = np.array(
+    [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4],
+     [1, 5, 7], [1, 7, 3]],
+    dtype=np.int32,
+)  # fmt: skip
+# No turn, and an eighth of a turn about the eye's axis.
+STRAIGHT, ASKEW = [1.0, 0.0, 0.0, 0.0], [np.cos(np.pi / 8), 0.0, np.sin(np.pi / 8), 0.0]
+
+
+def cubes(draw: object, turn: list[list[float]], size: float = 1.0) -> np.ndarray:
+    """A red cube in front of a blue one, a green one to the right of both, seen along -y."""
+    solids = tuple(Solid(size * CORNERS, SIDES, k, color) for k, color in enumerate(("red", "blue", "lime")))
+    stage = Stage(np.array([-1.5, -3.0, -1.5]), np.array([5.5, 3.0, 1.5]), (0.0, 1.0), KIND, solids)
+    frame = Frame(PLACE, np.zeros(3), turn=np.array(turn))
+    return draw(frame, stage, FRONT)  # type: ignore[operator, no-any-return]
+
+
+@pytest.mark.parametrize("draw", RENDERERS)
+def test_the_near_body_hides_the_far_one(draw: object) -> None:
+    picture = cubes(draw, [STRAIGHT] * 3)
+    red, green, blue = (pixels_like(picture, k) for k in range(3))
+    assert red > 500
+    assert green > 500
+    assert blue < red / 20
+
+
+@pytest.mark.parametrize("draw", RENDERERS)
+def test_a_body_is_drawn_as_it_is_turned(draw: object) -> None:
+    # On its edge a cube is √2 wide: its corners cover what was free beside it.
+    upright, askew = cubes(draw, [STRAIGHT] * 3), cubes(draw, [ASKEW, STRAIGHT, STRAIGHT])
+    rows = [np.flatnonzero((picture[..., 0] > 100) & (picture[..., 1:].max(axis=-1) < 60)) // FRONT.width
+            for picture in (upright, askew)]  # fmt: skip
+    heights = [np.ptp(found) for found in rows]
+    assert heights[1] / heights[0] == pytest.approx(np.sqrt(2.0), rel=0.1)
+
+
+def test_a_stage_of_bodies_is_not_stretched_by_the_few_that_roll_away() -> None:
+    still = [Frame(np.tile(PLACE, (40, 1)), np.ones(120)) for _ in range(2)]
+    rolled = np.tile(PLACE, (40, 1))
+    rolled[0, 0] = 500.0
+    ground = Solid(1e3 * np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [0.0, 1.0, 0.0]]), SIDES[:1] * 0, -1, "gray")
+    table = Solid(np.array([[7.0, 0.0, 0.0], [8.0, 0.0, 0.0], [7.0, 1.0, 0.0]]), SIDES[:1] * 0, -1, "gray")
+    stage = pictures.stage_of_solids([*still, Frame(rolled, np.ones(120))], KIND, [ground, table])
+    assert list(stage.low) == [-1.0, -3.0, -1.0]
+    assert list(stage.high) == [8.0, 3.0, 1.0]
+    # The ground goes on a tenth of the stage's length of 9 beyond it.
+    assert np.abs(stage.solids[0].vertices).max() == pytest.approx(8.9)
 
 
 def test_the_axes_of_a_view_are_right_handed_and_the_eye_is_above() -> None:
