@@ -372,9 +372,9 @@ def simulate(
             for name, choice in chosen.items()
             for specification, law in map(choose_resolver, solvers or (choice.default_solver,))
         }
-        if fresh:
-            _set_aside(out)
         folders = {name: out / _folder_name(name) if len(runs) > 1 else out for name in runs}
+        for folder in folders.values() if fresh else ():
+            _set_aside_run(folder)
         for name, (choice, specification, law) in runs.items():
             schedule = _schedule(choice, steps, cycles, frame_every, checkpoint_every)
             _say(f"{choice.label} by {specification}: {_extent(choice, schedule)}; results go to {folders[name]}")
@@ -844,6 +844,14 @@ def _set_aside(out: Path) -> None:
     aside = set_aside(out)
     if aside is not None:
         click.echo(f"earlier results are now in {aside}", err=True)
+
+
+def _set_aside_run(folder: Path) -> None:
+    from harness.simulation import set_aside_run
+
+    aside = set_aside_run(folder)
+    if aside is not None:
+        click.echo(f"the earlier run is now in {aside}", err=True)
 
 
 def _print_summary(out: Path, summary: Summary) -> None:

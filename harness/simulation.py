@@ -39,8 +39,8 @@ from harness.measurement import (
     upper_bound,
 )
 from harness.run import COMPARED
-from harness.store import Ending, PlannedTask, Store
-from harness.trajectory import Frame, RowWriter, TrajectoryWriter, read_table
+from harness.store import FILE_NAME, Ending, PlannedTask, Store, set_aside
+from harness.trajectory import FRAMES, Frame, RowWriter, TrajectoryWriter, read_table
 from scenarios.scenario import Invariant, Scenario
 from scenarios.world.checkpoint import CheckpointError, checkpoint, resume
 from scenarios.world.events import EventWorld
@@ -158,6 +158,33 @@ def simulate(
             _record_run(simulation, folder, store, run, steps=recorder.world.steps)
         store.finish_run(run)
     return why
+
+
+def set_aside_run(folder: Path) -> Path | None:
+    """Move what a run left into the first free earlier-N/ of its folder, for a fresh start that destroys nothing.
+
+    Returns:
+        The new folder, or None where there was no run.
+
+    Raises:
+        StoreError: a run is writing to it, or it cannot be renamed.
+    """
+    store = set_aside(folder)
+    kept = {path: path.name for path in (folder / CHECKPOINT, folder / STEPS, folder / MEASURES) if path.exists()}
+    kept |= {path: path.name for path in folder.glob(FRAMES)}
+    if store is not None:
+        # With the log of a killed run, without which rows would be missing.
+        parts = {store.with_name(store.name + suffix): FILE_NAME + suffix for suffix in ("-wal", "-shm", "")}
+        kept |= {path: name for path, name in parts.items() if path.exists()}
+    if not kept:
+        return None
+    number = 1
+    while (aside := folder / f"earlier-{number}").exists():
+        number += 1
+    aside.mkdir()
+    for path, name in kept.items():
+        path.rename(aside / name)
+    return aside
 
 
 def _run(

@@ -30,6 +30,7 @@ from harness.files import replace_file
 from harness.store import StoreError
 from solvers.solution import Floats
 
+FRAMES = "trajectory-*.npz"
 BODIES_PER_FILE = 240_000
 """Bodies of all frames of a file together: some megabytes."""
 # Rows of the series that are held back before they are written: a write a step would cost more than a small step.
@@ -72,7 +73,7 @@ class TrajectoryWriter:
         self._held = False
         """Whether that file lacks some of them."""
         kept = 0
-        for path in sorted(folder.glob("trajectory-*.npz")):
+        for path in sorted(folder.glob(FRAMES)):
             first = int(path.stem.rpartition("-")[2])
             if first >= frames:
                 path.unlink()
@@ -118,7 +119,7 @@ def read_frames(folder: Path) -> Iterator[Frame]:
     Raises:
         StoreError: a file is broken.
     """
-    for path in sorted(folder.glob("trajectory-*.npz")):
+    for path in sorted(folder.glob(FRAMES)):
         yield from _read_file(path)
 
 

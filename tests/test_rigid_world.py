@@ -475,3 +475,16 @@ def test_all_that_moves_can_be_drawn() -> None:
     where, turn = moving.given_pose("hull 4")
     shape, center = SHAPES["hull"], moving.position[moving.index("hull 4")]
     assert where + rotation_matrix(turn) @ shape.center == pytest.approx(center, abs=ROUNDING)
+
+
+def test_a_plank_on_a_hinge_comes_to_lie_on_what_is_fixed() -> None:
+    """Along the hinge's axis no impulse moves the plank: a row of W that is zero, and nothing to divide by."""
+    tilt = about((0.0, 1.0, 0.0), 0.3)
+    where = np.array([0.0, 0.0, 0.2]) + rotation_matrix(tilt) @ (0.35, 0.0, 0.07)
+    plank = RigidBody("plank", box((0.45, 0.12, 0.015)), (0.0, 0.0, 0.2), tilt, hinge=(0.0, 1.0, 0.0))
+    weight = RigidBody("weight", box((0.05, 0.05, 0.05)), where, tilt)
+    moving = world([floor(), plank, weight], step=2e-3)
+    run(moving, 1.5)
+    assert np.isfinite(moving.velocity).all()
+    assert np.isfinite(moving.spin).all()
+    assert moving.touching("plank", "floor") > 0.0

@@ -350,6 +350,21 @@ def test_the_command_writes_a_page_with_figures_and_pictures(tmp_path: Path) -> 
     assert "mgD" in said
 
 
+def test_a_fresh_run_starts_anew_and_keeps_the_earlier_one_whole(tmp_path: Path) -> None:
+    words = [SMALL, "--steps", "20", "--no-pictures", "--out", str(tmp_path)]
+    assert command(*words)[0] == 0
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir() if path.suffix in {".npz", ".csv", ".sqlite"}}
+    code, said = command(*words, "--fresh")
+    assert code == 0, said
+    aside = tmp_path / "earlier-1"
+    assert str(aside) in said
+    assert {path.name: path.read_bytes() for path in aside.iterdir()} == before
+    # The same scene made once more: as many rows, not twice as many, and not none.
+    assert len(read_table(tmp_path / STEPS)["step"]) == 20
+    assert command(*words, "--fresh")[0] == 0
+    assert (tmp_path / "earlier-2").is_dir()
+
+
 def test_the_command_compares_solvers_on_one_scene(tmp_path: Path) -> None:
     words = ["pool-break:balls=3", "--solver", "qce", "--solver", "lcp-pgs", "--no-pictures", "--out", str(tmp_path)]
     code, said = command(*words)
