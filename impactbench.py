@@ -368,8 +368,8 @@ def simulate(
         if len({choice.name for choice in chosen.values()}) > 1:
             raise BadInput("several scenes must be members of one family: they are compared")
         runs = {
-            _run_name(name, specification, chosen, solvers): (choice, specification, law)
-            for name, choice in chosen.items()
+            _run_name(choice, specification, chosen.values(), solvers): (choice, specification, law)
+            for choice in chosen.values()
             for specification, law in map(choose_resolver, solvers or (choice.default_solver,))
         }
         folders = {name: out / _folder_name(name) if len(runs) > 1 else out for name in runs}
@@ -384,16 +384,13 @@ def simulate(
             _write_comparison(folders, out, choice)
 
 
-def _run_name(label: str, solver: str, scenes: Collection[str], solvers: Collection[str]) -> str:
+def _run_name(scene: MovingScene, solver: str, scenes: Collection[MovingScene], solvers: Collection[str]) -> str:
     """What tells a run from the others: its scene's parameters that differ, its solver, or both."""
-    parameters = _parameters(label)
-    own = [parameter for parameter in parameters if any(parameter not in _parameters(other) for other in scenes)]
+    own = [
+        f"{name}={value}" for name, value in scene.parameters.items()
+        if any(other.parameters.get(name) != value for other in scenes)
+    ]  # fmt: skip
     return ", ".join([*own, solver] if len(solvers) > 1 or not own else own)
-
-
-def _parameters(label: str) -> list[str]:
-    """Parameters of a scene's label: "name(a=1, b=2)" → a=1, b=2."""
-    return label.partition("(")[2].removesuffix(")").split(", ")
 
 
 def _run_simulation(simulation: Simulation, out: Path, schedule: Schedule, until_pattern: bool) -> None:
@@ -413,9 +410,9 @@ def _run_simulation(simulation: Simulation, out: Path, schedule: Schedule, until
     _say(why)
 
 
-def _folder_name(specification: str) -> str:
-    """A solver's folder: its specification without what a path may not hold."""
-    return re.sub(r"[^\w.=,-]+", "_", specification)
+def _folder_name(run: str) -> str:
+    """A run's folder: its name without what a path may not hold."""
+    return re.sub(r"[^\w.=,-]+", "_", run)
 
 
 def _schedule(
@@ -578,7 +575,7 @@ def export(out: Path, table: Any, form: str, to: Path | None) -> None:
     """Write one table of the results in OUT for use elsewhere.
 
     In CSV, structured columns are JSON text. In JSON, missing numbers are null and infinite ones "inf" or "-inf".
-    Parquet needs pyarrow.
+    Parquet needs pyarrow: pip install 'impactbench[export]'.
 
     \b
     Examples:

@@ -25,7 +25,7 @@ from harness.files import replace_file
 from harness.selection import choose_moving
 from harness.simulation import STEPS
 from harness.store import Store, StoreError
-from harness.trajectory import read_frames, read_table
+from harness.trajectory import BROKEN, read_frames, read_table
 from scenarios.patterns import Pattern, height_map, measure_pattern
 from solvers.solution import Floats
 
@@ -118,12 +118,13 @@ def read_record(path: Path) -> PatternRecord:
         StoreError: the file is none, or broken.
     """
     try:
-        with np.load(path) as arrays:
+        # Opened here: NumPy leaves the file open where it is cut off.
+        with path.open("rb") as file, np.load(file) as arrays:
             height = arrays["height"]
             return PatternRecord(
                 json.loads(str(arrays["run"])), arrays["cycle"], np.where(height == 0, np.nan, height * UNIT)
             )
-    except (OSError, ValueError, KeyError, EOFError) as error:
+    except BROKEN as error:
         raise StoreError(f"{path} is no record of a pattern, or broken: {error}") from error
 
 

@@ -60,6 +60,8 @@ COLUMNS = (
     "kinetic", "potential", "impact", "friction", "correction", "shaking", "integration", "wall_s",
 )  # fmt: skip
 """Columns of the series; all but wall_s come out the same whenever the run is repeated."""
+LEDGER = ("impact", "friction", "correction", "shaking", "integration")
+"""Those in which a step's change of kinetic and potential energy is booked; their sum is that change."""
 # Impacts of a run with a fixed step that are scored by themselves, evenly spread over it.
 PROBES = 8
 # A probe solves its impact again and again, renumbered and mirrored: above this many contacts that takes minutes.
@@ -242,7 +244,7 @@ class _Recorder:
         made = self.world.steps
         self._timed = isinstance(self.world, EventWorld)
         self._measure_every = schedule.frame_every if self._timed else self._scene.measure_every or schedule.frame_every
-        # Frames of a scene from impact to impact are those before its last impact; else one at the start, too.
+        # Frames of a scene from impact to impact are those before its last impact, and one at the start.
         frames = self._due(self.world.time) if self._timed else made // schedule.frame_every + 1
         measured = frames if self._timed else made // self._measure_every + 1
         self.measures = dict(self._scene.measure(self.world))
@@ -252,7 +254,7 @@ class _Recorder:
         columns = ("step", "time", *self.measures)
         self._measured = RowWriter(folder / MEASURES, columns, rows=measured if resumed else 0)
         self._trajectory = TrajectoryWriter(folder, frames=frames if resumed else 0)
-        if not resumed and not self._timed:
+        if not resumed:
             self._frame()
             self._measure()
 
@@ -296,8 +298,8 @@ class _Recorder:
         replace_file(self._folder / CHECKPOINT, checkpoint(self.world))
 
     def _due(self, now: float) -> int:
-        """Frames before a time, where they are at equal times."""
-        return math.ceil(now / self._scene.frame_time)
+        """Frames before a time, where they are at equal times; the first one is of the start, impact or not."""
+        return max(math.ceil(now / self._scene.frame_time), 1)
 
     def _watch_until(self, frames: int) -> None:
         """Take the frames that are missing of so many, in the flight to the next impact; the world stays as it is."""
@@ -431,7 +433,7 @@ def _energy_scores(column: Mapping[str, Floats]) -> Iterator[Score]:
         detail={"step": int(column["step"][worst])},
     )  # fmt: skip
     yield shown("KIN", "energy error e, mean over the steps", float(np.abs(change).mean()))
-    total = {name: float(column[name].sum()) for name in ("impact", "friction", "correction", "shaking", "integration")}
+    total = {name: float(column[name].sum()) for name in LEDGER}
     scale = float(np.abs(column["kinetic"]).max()) or 1.0
     for name, joule in total.items():
         yield shown("energy", f"{name}, over the largest kinetic energy", joule / scale)

@@ -18,6 +18,8 @@ from __future__ import annotations
 import csv
 import io
 import os
+import zipfile
+import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -31,6 +33,8 @@ from harness.store import StoreError
 from solvers.solution import Floats
 
 FRAMES = "trajectory-*.npz"
+BROKEN = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error)
+"""What reading an .npz file raises that was cut off, overwritten, or is none."""
 BODIES_PER_FILE = 240_000
 """Bodies of all frames of a file together: some megabytes."""
 # Rows of the series that are held back before they are written: a write a step would cost more than a small step.
@@ -42,13 +46,15 @@ class Frame:
     """The spheres at one moment."""
 
     step: int
+    """Steps made."""
     time: float
+    """Since the start, in the scene's unit of time."""
     height: float
-    """Of the container over its place at rest."""
+    """Of the container over its place at rest, in the scene's unit of length."""
     place: Floats
-    """Centers and radii, shape (bodies, 4)."""
+    """Centers and radii in the container's frame, in the scene's unit of length, shape (bodies, 4)."""
     velocity: Floats
-    """Shape (bodies, 3)."""
+    """In the scene's unit of speed, shape (bodies, 3)."""
     turn: Floats = field(default_factory=lambda: np.zeros((0, 4)))
     """Orientations as quaternions (w, x, y, z), shape (bodies, 4); (0, 4) where all bodies are spheres."""
 
@@ -73,11 +79,14 @@ class TrajectoryWriter:
         self._held = False
         """Whether that file lacks some of them."""
         kept = 0
+        before = []
         for path in sorted(folder.glob(FRAMES)):
-            first = int(path.stem.rpartition("-")[2])
-            if first >= frames:
+            if _first_frame(path) >= frames:
                 path.unlink()
-                continue
+            else:
+                before.append(path)
+        for path in before[-1:]:
+            first = _first_frame(path)
             self._open = list(_read_file(path))[: frames - first]
             # Those after them must go from the file as well.
             self._held = True
@@ -174,13 +183,19 @@ def write_arrays(path: Path, **arrays: Any) -> None:
     replace_file(path, buffer.getvalue())
 
 
+def _first_frame(path: Path) -> int:
+    """Number of a file's first frame, by its name."""
+    return int(path.stem.rpartition("-")[2])
+
+
 def _read_file(path: Path) -> Iterator[Frame]:
     try:
-        with np.load(path) as arrays:
+        # Opened here: NumPy leaves the file open where it is cut off.
+        with path.open("rb") as file, np.load(file) as arrays:
             step, time, height = arrays["step"], arrays["time"], arrays["height"]
             place, velocity = arrays["place"], arrays["velocity"]
             turn = arrays["turn"] if "turn" in arrays else np.zeros((len(step), 0, 4))
-    except (OSError, ValueError, KeyError) as error:
+    except BROKEN as error:
         raise StoreError(f"{path} is no trajectory file, or broken: {error}") from error
     for k in range(len(step)):
         yield Frame(int(step[k]), float(time[k]), float(height[k]), place[k], velocity[k], turn[k])

@@ -33,7 +33,7 @@ def write_parquet(frame: pd.DataFrame, to: Path) -> None:
         ReportError: pyarrow is not installed, or the file cannot be written.
     """
     if importlib.util.find_spec("pyarrow") is None:
-        raise ReportError("Parquet needs pyarrow: pip install pyarrow, or choose --format csv")
+        raise ReportError("Parquet needs pyarrow: pip install 'impactbench[export]', or choose --format csv")
     write_whole(to, _flat(frame).to_parquet(None, index=False))
 
 

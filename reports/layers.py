@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +11,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
+from scipy.stats import binned_statistic_2d
 
 from harness import trajectory
 from reports.figures import BLUE, TWO_COLUMNS, VERMILLION
@@ -29,10 +31,11 @@ class Layers:
     """A bed when it lay, and when the run ended."""
 
     before: Floats
-    """Centers, shape (bodies, 3)."""
+    """Centers when it lay, in the scene's unit of length, shape (bodies, 3)."""
     after: Floats
-    """Shape (bodies, 3)."""
+    """Centers of the same bodies when the run ended, shape (bodies, 3)."""
     times: tuple[float, float]
+    """Of the two, in the scene's unit of time."""
 
 
 def at_or_after(time: float, wanted: float) -> bool:
@@ -44,10 +47,12 @@ def read_layers(folder: Path, scene: MovingScene) -> Layers | None:
     """Read the two moments; None for a scene that has no layers, or a run that ended before they lay."""
     if scene.color_from == 0.0:
         return None
-    late = [frame for frame in trajectory.read_frames(folder) if at_or_after(frame.time, scene.color_from)]
-    if len(late) < 2:
+    late = (frame for frame in trajectory.read_frames(folder) if at_or_after(frame.time, scene.color_from))
+    first = next(late, None)
+    # Of the frames after it one at a time is held: all of a long run together would not fit into memory.
+    last = next(iter(deque(late, maxlen=1)), None)
+    if first is None or last is None:
         return None
-    first, last = late[0], late[-1]
     return Layers(
         first.place[:, :3].astype(np.float64), last.place[:, :3].astype(np.float64), (first.time, last.time)
     )  # fmt: skip
@@ -113,14 +118,10 @@ def _depths(layers: Layers) -> list[float]:
 
 def _profiles(layers: Layers) -> tuple[Floats, Floats, Floats]:
     """Middles of the parts of the floor, and the mean height of each layer over them before and after."""
-    number, x = layer_numbers(layers.before, LAYERS), layers.before[:, 0]
-    edges = np.linspace(x.min(), x.max(), PARTS + 1)
-    part = np.clip(np.searchsorted(edges, x, side="right") - 1, 0, PARTS - 1)
-    heights = np.full((2, LAYERS, PARTS), np.nan)
-    for moment, place in enumerate((layers.before, layers.after)):
-        for k in range(LAYERS):
-            for p in range(PARTS):
-                chosen = place[(number == k) & (part == p), 2]
-                if chosen.size:
-                    heights[moment, k, p] = chosen.mean()
-    return 0.5 * (edges[1:] + edges[:-1]), heights[0], heights[1]
+    x = layers.before[:, 0]
+    found = binned_statistic_2d(
+        layer_numbers(layers.before, LAYERS), x, [layers.before[:, 2], layers.after[:, 2]],
+        bins=[np.arange(LAYERS + 1), np.linspace(x.min(), x.max(), PARTS + 1)],
+    )  # fmt: skip
+    before, after = found.statistic
+    return 0.5 * (found.y_edge[1:] + found.y_edge[:-1]), before, after

@@ -23,7 +23,7 @@ from reports.figures import BLACK, BLUE, GREEN, STYLE, TWO_COLUMNS, VERMILLION, 
 from reports.files import prepare, write_whole
 from reports.markdown import markdown_table
 from reports.scorecard import ReportError
-from scenarios.granular import DRIVING, PUBLISHED, REACHED, named_measures
+from scenarios.granular import DRIVING, PUBLISHED, THRESHOLDS, named_measures, shows
 from scenarios.patterns import Pattern
 
 COLORS = {"squares": VERMILLION, "stripes": BLUE, "hexagons": GREEN, "flat": BLACK}
@@ -85,8 +85,7 @@ def patterns_markdown(records: Sequence[PatternRecord]) -> str:
             [row for record in records for row in _comparison_rows(record)],
         ),
         "",
-        "A pattern stands from the cycle on from which all later maps pass its threshold: squares Q4 > 0.75 and "
-        "Q2 < 0.1, stripes Q2 > 0.8, hexagons Q6 > 0.45 and Q2 < 0.1.",
+        f"A pattern stands from the cycle on from which all later maps pass its thresholds: {_thresholds()}.",
         "",
         "## Beside Table 2 of Zhang 2015",
         "",
@@ -107,7 +106,7 @@ def standing_since(record: PatternRecord) -> int | None:
     """First stored cycle from which on every map shows the pattern; None if the last one does not."""
     since = None
     for cycle, found in zip(record.cycles, record.measures(), strict=True):
-        if not REACHED[record.pattern](named_measures(found)):
+        if not shows(record.pattern, named_measures(found)):
             since = None
         elif since is None:
             since = int(cycle)
@@ -129,6 +128,16 @@ def _comparison_rows(record: PatternRecord) -> Iterator[tuple[str, ...]]:
     yield (
         "", "Bizon 1998", str(panel.cycles or "–"), f"{panel.wavelength or '–'}", f"{panel.q2:.3f}", f"{panel.q4:.3f}",
         f"{panel.q6:.3f}", "–", "",
+    )  # fmt: skip
+
+
+def _thresholds() -> str:
+    """What a map must show of each pattern, in words."""
+    return ", ".join(
+        f"{pattern} " + " and ".join(
+            f"{name} > {low:g}" if np.isfinite(low) else f"{name} < {high:g}" for name, (low, high) in bounds.items()
+        )
+        for pattern, bounds in THRESHOLDS.items() if bounds
     )  # fmt: skip
 
 
@@ -176,7 +185,7 @@ def _run_lines(record: PatternRecord) -> Iterator[str]:
 def _shown(record: PatternRecord, found: Pattern) -> str:
     if record.pattern == "flat":
         return "–"
-    return "yes" if REACHED[record.pattern](named_measures(found)) else "no"
+    return "yes" if shows(record.pattern, named_measures(found)) else "no"
 
 
 def _draw_map(axes: Axes, record: PatternRecord, k: int) -> None:

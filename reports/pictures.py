@@ -39,7 +39,7 @@ KIND = "kind"
 STRAYS = 0.03
 # Scenery longer than this goes on without end [m].
 ENDLESS = 500.0
-# How far such scenery goes on beyond the stage, as a share of its size.
+# How far such scenery goes on beyond the stage and all that moves, as a share of the stage.
 RIM = 0.1
 # Shade of a triangle that the light grazes, over one that faces it (matplotlib).
 SHADOW = 0.55
@@ -144,7 +144,7 @@ def stage_of(frames: Iterable[Frame], color_name: str) -> Stage:
 def stage_of_solids(frames: Iterable[Frame], color_name: str, solids: Sequence[Solid]) -> Stage:
     """Make a stage around the start of solid bodies and where most of them come to: a few may roll out of sight.
 
-    Scenery without end, such as the ground, is cut a little outside of the stage.
+    Scenery without end, such as the ground, is cut a little outside of the stage and of all that ever moves.
     """
     places, colors = [], []
     for frame in frames:
@@ -158,8 +158,9 @@ def stage_of_solids(frames: Iterable[Frame], color_name: str, solids: Sequence[S
         if solid.body < 0 and np.ptp(solid.vertices, axis=0).max() < ENDLESS:
             low, high = np.minimum(low, solid.vertices.min(axis=0)), np.maximum(high, solid.vertices.max(axis=0))
     rim = RIM * (high - low)
+    least, most = np.minimum(low, centers.min(axis=0)) - rim, np.maximum(high, centers.max(axis=0)) + rim
     cut = [
-        replace(solid, vertices=np.clip(solid.vertices, low - rim, high + rim)) if solid.body < 0 else solid
+        replace(solid, vertices=np.clip(solid.vertices, least, most)) if solid.body < 0 else solid
         for solid in solids
     ]
     hottest = max(float(np.concatenate(colors).max()), np.finfo(np.float64).tiny)

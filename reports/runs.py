@@ -6,6 +6,7 @@ import math
 from collections import deque
 from collections.abc import Mapping
 from pathlib import Path
+from textwrap import fill
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -32,6 +33,8 @@ LAST_FRAMES = 300
 # Panels side by side, and what the labels of one take of its width [in].
 ACROSS = 4
 MARGIN = 0.5
+# Letters of an axis label that fit beside a panel; a longer one is broken into lines.
+LABEL_WIDTH = 26
 
 
 def results_of(store: Frames) -> Results:
@@ -96,7 +99,7 @@ def measures_figure(runs: Mapping[str, Path], scene: MovingScene) -> Figure:
             values = np.maximum(measures[name], NO_ERROR) if is_error(name) else measures[name]
             axes.plot(measures[over], values, color=color, linestyle=line, marker="." if few else "", label=solver)
     for axes, name in zip(panels, names, strict=False):
-        axes.set_ylabel(name)
+        axes.set_ylabel(fill(name, LABEL_WIDTH))
         axes.set_xlabel(label)
         if name.startswith("balls"):
             axes.yaxis.set_major_locator(MaxNLocator(integer=True))

@@ -32,7 +32,6 @@ from reports.scorecard import ReportError
 from reports.wording import number
 from scenarios.world.moving_scene import STAGES_FIRED, MovingScene, Units
 from scenarios.world.rigid_world import RigidWorld
-from solvers import SOLVERS
 from solvers.solution import Floats
 
 VIEWS = {"xy": pictures.View(elevation=90.0, azimuth=-90.0), "tx": pictures.View(elevation=0.0, azimuth=-90.0)}
@@ -163,10 +162,10 @@ def write_pictures(
         raise ReportError(f"{folder} holds no frames")
     paint, view = _painter(folder, scene), VIEWS.get(scene.trace, pictures.View())
     painted = (paint(frame) for frame in trajectory.read_frames(folder))
-    solids = solids_of(scene)
-    stage = (
-        pictures.stage_of_solids(painted, scene.color, solids) if solids else pictures.stage_of(painted, scene.color)
-    )
+    if next(trajectory.read_frames(folder)).turn.size:
+        stage = pictures.stage_of_solids(painted, scene.color, solids_of(scene))
+    else:
+        stage = pictures.stage_of(painted, scene.color)
     wanted = set(np.linspace(0, count - 1, STILLS).round().astype(int))
     written = []
     for k, frame in enumerate(trajectory.read_frames(folder)):
@@ -201,10 +200,9 @@ def _painter(folder: Path, scene: MovingScene) -> Callable[[trajectory.Frame], p
 
 
 def solids_of(scene: MovingScene) -> list[pictures.Solid]:
-    """What is drawn of a scene of rigid bodies, each kind in a color of its own; empty where all are spheres."""
-    world = scene.world(solver=SOLVERS["qce-lcp"]())
-    if not isinstance(world, RigidWorld):
-        return []
+    """What is drawn of a scene of rigid bodies, each kind in a color of its own."""
+    world = scene.world()
+    assert isinstance(world, RigidWorld)
     kinds: dict[str, str] = {}
     solids = []
     for name, vertices, faces, body in world.meshes():

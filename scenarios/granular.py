@@ -5,7 +5,7 @@ Units are the grains' own: mean diameter D = 1, g = 1, mean mass 1; velocity √
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 
@@ -16,7 +16,7 @@ from scenarios.parameters import check_choice, check_count, check_number, check_
 from scenarios.patterns import Pattern, height_map, measure_pattern
 from scenarios.world.container import Motion, Shake, Vibration, box
 from scenarios.world.impact import Constant, Resolver, SlowingRestitution
-from scenarios.world.moving_scene import MovingScene, MovingWorld, Units, never
+from scenarios.world.moving_scene import MovingScene, MovingWorld, Units
 from scenarios.world.spheres import Spheres, spheres
 from scenarios.world.stepping import Settings, World
 from solvers.solution import Floats
@@ -118,7 +118,7 @@ def extended_pattern(
         measure_every=steps_per_cycle,
         color="height [D]",
         units=GRAINS,
-        reached=REACHED[pattern],
+        reached=partial(shows, pattern),
     )
 
 
@@ -156,13 +156,19 @@ PUBLISHED = {
 }
 """Pattern → its panel; of hexagons there are two, with Q4 0.28 and 0.31, Q6 0.48 and 0.49."""
 
-REACHED: dict[str, Callable[[Mapping[str, float]], bool]] = {
-    "squares": lambda found: found["Q4"] > 0.75 and found["Q2"] < 0.1,
-    "stripes": lambda found: found["Q2"] > 0.8,
-    "hexagons": lambda found: found["Q6"] > 0.45 and found["Q2"] < 0.1,
-    "flat": never,
+THRESHOLDS: dict[str, Mapping[str, tuple[float, float]]] = {
+    "squares": {"Q4": (0.75, np.inf), "Q2": (-np.inf, 0.1)},
+    "stripes": {"Q2": (0.8, np.inf)},
+    "hexagons": {"Q6": (0.45, np.inf), "Q2": (-np.inf, 0.1)},
+    "flat": {},
 }
-"""Pattern → whether measures show it: the thresholds that the published panels pass (see `scenarios.patterns`)."""
+"""Pattern → measure → between which it lies, as it does on the published panels (see `scenarios.patterns`)."""
+
+
+def shows(pattern: str, found: Mapping[str, float]) -> bool:
+    """Whether measures show a pattern; of "flat" nothing says so."""
+    inside = [low < found[name] < high for name, (low, high) in THRESHOLDS[pattern].items()]
+    return bool(inside) and all(inside)
 
 
 def vibration(pattern: str) -> Vibration:

@@ -310,7 +310,6 @@ def test_export_writes_json_that_every_reader_takes(measured: Path, tmp_path: Pa
 
 
 def test_export_writes_parquet_with_the_same_numbers(measured: Path) -> None:
-    pytest.importorskip("pyarrow", reason="Parquet is an extra")
     to = measured / "scores.parquet"
     asked = ("export", "--out", str(measured / "results"), "--format", "parquet")
     done = call(*asked, "--table", "scores", "--to", str(to))

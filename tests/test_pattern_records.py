@@ -122,8 +122,18 @@ def broken(folder: Path) -> None:
     (folder / "squares.npz").write_bytes(b"nonsense")
 
 
+def cut_off(folder: Path) -> None:
+    path = write_record(folder / "squares.npz", record("squares", waves(2)))
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
 @pytest.mark.parametrize(
-    ("prepare", "said"), [(lambda _: None, "holds no records of patterns"), (broken, "no record of a pattern")]
+    ("prepare", "said"),
+    [
+        (lambda _: None, "holds no records of patterns"),
+        (broken, "no record of a pattern"),
+        (cut_off, "no record of a pattern"),
+    ],
 )
 def test_a_folder_without_sound_records_is_named(prepare: Callable[[Path], None], said: str, tmp_path: Path) -> None:
     prepare(tmp_path)

@@ -108,8 +108,9 @@ def test_a_stage_of_bodies_is_not_stretched_by_the_few_that_roll_away() -> None:
     stage = pictures.stage_of_solids([*still, Frame(rolled, np.ones(120))], KIND, [ground, table])
     assert list(stage.low) == [-1.0, -3.0, -1.0]
     assert list(stage.high) == [8.0, 3.0, 1.0]
-    # The ground goes on a tenth of the stage's length of 9 beyond it.
-    assert np.abs(stage.solids[0].vertices).max() == pytest.approx(8.9)
+    # The ground carries also what rolled away, and goes on beyond it by a tenth of the stage's length of 9.
+    assert stage.solids[0].vertices.max() == pytest.approx(500.9)
+    assert stage.solids[0].vertices.min() == pytest.approx(-3.6)
 
 
 def test_the_axes_of_a_view_are_right_handed_and_the_eye_is_above() -> None:

@@ -20,6 +20,7 @@ from harness.simulation import CHECKPOINT, COLUMNS, MEASURES, STEPS, Schedule, S
 from harness.simulation import simulate as run_simulation
 from harness.store import IncomparableResults, Store, StoreError
 from harness.trajectory import Frame, RowWriter, TrajectoryWriter, read_frames, read_table
+from reports.comparison import comparison_markdown
 from reports.layers import layers_lines, read_layers
 from reports.runs import numbers
 from reports.simulation import simulation_markdown, write_simulation
@@ -243,6 +244,42 @@ def test_an_interrupted_run_from_impact_to_impact_goes_on_bit_for_bit(scene: str
     assert kept(tmp_path / "parts") == kept(tmp_path / "whole")
 
 
+def test_an_impact_at_the_start_is_in_the_first_frame_and_in_the_measures(tmp_path: Path) -> None:
+    swing(tmp_path, "pool-break:balls=3,approach=0", "qce", Schedule(1, 1, 10))
+    (frame,) = read_frames(tmp_path)
+    assert (frame.step, frame.time) == (0, 0.0)
+    assert len(read_table(tmp_path / MEASURES)) == 1
+
+
+@pytest.mark.parametrize("stop_at", [2, 4])
+def test_a_comparison_of_runs_that_were_gone_on_with_gives_the_share_of_all_their_steps(
+    stop_at: int, tmp_path: Path
+) -> None:
+    scene = "cradle-3d:balls=3"
+    for solver in ("qce", "lcp-pgs:max_iterations=1"):
+        with pytest.raises(KeyboardInterrupt):
+            swing(tmp_path / solver, scene, solver, Schedule(5, 1, 2), stop_at=stop_at)
+        swing(tmp_path / solver, scene, solver, Schedule(5, 1, 2))
+    runs = {path.name: path for path in sorted(tmp_path.iterdir())}
+    page = comparison_markdown(runs, choose_moving(scene))
+    for name, folder in runs.items():
+        share = 100 * (read_table(folder / STEPS)["status"] == "converged").mean()
+        assert re.search(rf"^\| {re.escape(name)} \|.*\| {share:.3g} % \|", page, re.MULTILINE)
+
+
+def test_energy_kept_is_over_that_before_the_first_step(tmp_path: Path) -> None:
+    # Grains that fall lose nothing but what integration adds; the first step's share is in the ledger.
+    go(tmp_path, small(), steps=3)
+    rows = read_table(tmp_path / STEPS)
+    world = choose_moving(SMALL).world(solver="qce-lcp-fast")
+    spheres = world.spheres
+    kinetic = spheres.kinetic_energy()
+    potential = float((spheres.position[:, 2] / spheres.inverse_mass).sum())
+    page = comparison_markdown({"a": tmp_path}, choose_moving(SMALL))
+    kept_share = float(rows["kinetic"].iloc[-1] + rows["potential"].iloc[-1]) / (kinetic + potential)
+    assert f"| {kept_share:.6f} |" in page
+
+
 def test_a_law_that_lets_all_balls_creep_fails_break_away_over_the_run(tmp_path: Path) -> None:
     for solver in ("qce", "lcp-pgs"):
         swing(tmp_path / solver, "cradle-3d", solver, cradle_periods(2.0))
@@ -379,7 +416,7 @@ def test_the_command_compares_solvers_on_one_scene(tmp_path: Path) -> None:
 
 
 def test_runs_are_named_by_what_tells_them_apart() -> None:
-    one, two = "cradle-3d(balls=5, raised=1)", "cradle-3d(balls=5, raised=2)"
+    one, two = choose_moving("cradle-3d:balls=5,raised=1"), choose_moving("cradle-3d:balls=5,raised=2")
     assert impactbench._run_name(one, "qce", [one], ["qce", "gr"]) == "qce"
     assert impactbench._run_name(one, "qce", [one, two], []) == "raised=1"
     assert impactbench._run_name(two, "gr", [one, two], ["qce", "gr"]) == "raised=2, gr"
