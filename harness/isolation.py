@@ -46,6 +46,8 @@ ALARM_GRACE_S = 10.0
 TASKS_PER_WORKER = 200
 # A pool that broke (a worker was killed between two tasks) is made anew; this often without any progress is a fault.
 MOST_RESTARTS = 3
+# Signals that also end a compiled library (OSQP among them) that goes on without the memory that it was refused.
+MEMORY_SIGNALS = (signal.SIGSEGV, signal.SIGBUS, signal.SIGABRT)
 # Exit code by which a worker says that the memory limit was reached; no signal and no shell uses it.
 OUT_OF_MEMORY_EXIT = 77
 # One thread a worker: --jobs says how many cores are used, and sums do not depend on how many there are.
@@ -169,7 +171,10 @@ def _ending_of_death(error: BaseException, wall_s: float, limits: Limits) -> End
     if code == -signal.SIGALRM:
         return Ending(Outcome.TIMED_OUT, f"killed by the alarm after {limits.timeout_s:g} s", wall_s)
     if code is not None and code < 0:
-        return Ending(Outcome.CRASHED, f"the process was killed by {_signal_name(-code)}", wall_s)
+        reason = f"the process was killed by {_signal_name(-code)}"
+        if -code in MEMORY_SIGNALS:
+            reason += f" (so may end, too, what does not check its allocations, at a limit of {limits.memory_mb:g} MiB)"
+        return Ending(Outcome.CRASHED, reason, wall_s)
     return Ending(Outcome.CRASHED, f"the process ended by itself with exit code {code}", wall_s)
 
 

@@ -104,7 +104,7 @@ EXPECTED = {
     "Exits": ("raised", r"SystemExit: 0"),
     "LeavesWithoutAWord": ("crashed", r"ended by itself with exit code 3"),
     "IsKilled": ("crashed", r"killed by SIGKILL"),
-    "Segfaults": ("crashed", r"killed by SIGSEGV"),
+    "Segfaults": ("crashed", r"killed by SIGSEGV \(so may end, too, .* at a limit of \d+ MiB\)"),
     "EatsMemory": ("out of memory", r"memory limit of 1024 MiB"),
     "WrongShape": ("invalid", r"impulse"),
     "NotANumber": ("invalid", r"v_post"),
