@@ -750,6 +750,37 @@ def accept(
     click.echo(f"written: {baseline}: {len(new.entries)} solvers × scenes", err=True)
 
 
+@main.command(epilog=GATE_EXIT_CODES)
+@click.argument("earlier", type=click.Path(exists=True, file_okay=False, path_type=Path))
+@click.argument("later", type=click.Path(exists=True, file_okay=False, path_type=Path))
+@click.option("--report", type=click.Path(dir_okay=False, path_type=Path), help="Write the tables as Markdown too.")
+def compare(earlier: Path, later: Path, report: Path | None) -> None:
+    """Compare two results folders of scorecards or runs: what got worse, better, or is missing in LATER.
+
+    As `check` does it, with EARLIER for the baseline: of two commits, two machines, two versions of a library. Nothing
+    is measured. What EARLIER has no answer to cannot get worse, and is new.
+
+    \b
+    Examples:
+      impactbench compare results/before results/after
+      impactbench compare results other-machine/results --report compare.md
+    """  # noqa: D301
+    with _explained_errors():
+        from harness import baseline as gate
+        from reports.gate import gate_markdown, render_gate
+
+        with _open(earlier) as store:
+            accepted = gate.as_baseline(store, f"results in {earlier}")
+        with _open(later) as store:
+            of_later = gate.as_baseline(store, f"results in {later}")
+            gate.check_same_run(accepted, tier=of_later.tier, seed=of_later.seed)
+            comparison = gate.compare(accepted, gate.collect(store), environment=gate.latest_environment(store))
+        render_gate(comparison, _console())
+        if report is not None:
+            _write_text(report, gate_markdown(comparison))
+    sys.exit(EXIT_FAILED_TASKS if comparison.failures else 0)
+
+
 def _measure_gate(out: Path, plan: list[PlannedTask], *, no_measure: bool, fresh: bool, **options: Any) -> None:
     """Measure what the gate compares, as far as OUT lacks it; who lost a task is in the table."""
     if no_measure and fresh:

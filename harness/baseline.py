@@ -199,8 +199,12 @@ def plan_gate(*, tier: str, seed: int, solvers: Sequence[str] | None) -> list[Pl
     return [planned for planned in plan if planned.task.kind.value == IMPACT]
 
 
-def collect(store: Frames, plan: Sequence[PlannedTask]) -> dict[Pair, Entry]:
+def collect(store: Frames, plan: Sequence[PlannedTask] | None = None) -> dict[Pair, Entry]:
     """Read what a store has of the tasks of a plan; tasks that it does not have are left out.
+
+    Args:
+        store: of a results folder.
+        plan: single impacts; None for all that the store has.
 
     Raises:
         ResultsError: the store has rows that cannot be read.
@@ -209,18 +213,41 @@ def collect(store: Frames, plan: Sequence[PlannedTask]) -> dict[Pair, Entry]:
     results = Results(store)
     for row in results.scores:
         rows.setdefault(row.task.task, []).append(row)
-    seeds = _task_seeds(store)
-    stored = {(task.solver, task.label, seeds[task.task]): task for task in results.tasks if task.kind == IMPACT}
+    tasks = [task for task in results.tasks if task.kind == IMPACT]
+    if plan is not None:
+        seeds = _task_seeds(store)
+        wanted = {(planned.task.solver, planned.label, planned.task.seed) for planned in plan}
+        tasks = [task for task in tasks if (task.solver, task.label, seeds[task.task]) in wanted]
     contacts: dict[str, int] = {}
     entries = {}
-    for planned in plan:
-        task = stored.get((planned.task.solver, planned.label, planned.task.seed))
-        if task is None:
-            continue
-        if planned.label not in contacts:
-            contacts[planned.label] = build_scenario(planned.task.scenario, planned.task.parameters).problem.m
-        entries[task.solver, task.label] = _entry(task, rows.get(task.task, ()), contacts=contacts[planned.label])
+    for task in tasks:
+        if task.label not in contacts:
+            contacts[task.label] = build_scenario(task.scenario, task.parameters).problem.m
+        entries[task.solver, task.label] = _entry(task, rows.get(task.task, ()), contacts=contacts[task.label])
     return entries
+
+
+def as_baseline(store: Frames, reason: str) -> Baseline:
+    """Take all single impacts of a results folder for accepted, lost ones left out.
+
+    Args:
+        store: of the folder.
+        reason: for the record: where they come from.
+
+    Raises:
+        BaselineError: it has no answer to a single impact.
+        ResultsError: the store has rows that cannot be read.
+    """
+    entries = {pair: entry for pair, entry in collect(store).items() if not _is_lost(entry)}
+    if not entries:
+        raise BaselineError(f"{reason}: no solver has an answer to a single impact there")
+    settings, environment = store.frame("runs").iloc[-1]["settings"], latest_environment(store)
+    record = {
+        "date": datetime.now(UTC).date().isoformat(), "version": environment.get("impactbench"),
+        "commit": environment.get("commit"), "reason": reason,
+    }  # fmt: skip
+    kept = {key: environment.get(key) for key in _ENVIRONMENT}
+    return Baseline(settings["tier"], settings["seed"], None, kept, entries, (record,))
 
 
 def compare(

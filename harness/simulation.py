@@ -62,6 +62,8 @@ COLUMNS = (
 """Columns of the series; all but wall_s come out the same whenever the run is repeated."""
 LEDGER = ("impact", "friction", "correction", "shaking", "integration")
 """Those in which a step's change of kinetic and potential energy is booked; their sum is that change."""
+TIME_ROUNDING = 1e-12
+"""Share by which a time that is a sum of steps may miss the one that is meant."""
 # Impacts of a run with a fixed step that are scored by themselves, evenly spread over it.
 PROBES = 8
 # A probe solves its impact again and again, renumbered and mirrored: above this many contacts that takes minutes.
@@ -282,13 +284,13 @@ class _Recorder:
         if isinstance(world, EventWorld):
             return world.time + world.flight.time_to_impact()
         # Times are sums of steps: rounding must not add one.
-        return math.inf if world.over else world.time * (1.0 + 1e-12) + math.ulp(0.0)
+        return math.inf if world.over else world.time * (1.0 + TIME_ROUNDING) + math.ulp(0.0)
 
     def watch(self, until: float) -> None:
         """Take the frames of a free flight up to a time, that one included."""
         if self._timed and math.isfinite(until):
             # A time that is a whole number of frames may miss the last one by rounding.
-            self._watch_until(math.floor(until / self._scene.frame_time * (1.0 + 1e-12)) + 1)
+            self._watch_until(math.floor(until / self._scene.frame_time * (1.0 + TIME_ROUNDING)) + 1)
 
     def checkpoint(self) -> None:
         """Keep the state. Rows and frames first: a checkpoint never says more than there is."""

@@ -14,6 +14,7 @@ from matplotlib.ticker import MaxNLocator
 from scipy.stats import binned_statistic_2d
 
 from harness import trajectory
+from harness.simulation import TIME_ROUNDING
 from reports.figures import BLUE, TWO_COLUMNS, VERMILLION
 from reports.markdown import markdown_table
 from scenarios.granular import layer_displacement, layer_numbers
@@ -39,8 +40,8 @@ class Layers:
 
 
 def at_or_after(time: float, wanted: float) -> bool:
-    """Whether a frame is as late as wanted; times are sums of steps."""
-    return time >= wanted * (1.0 - 1e-9)
+    """Whether a frame is as late as wanted."""
+    return time >= wanted * (1.0 - TIME_ROUNDING)
 
 
 def read_layers(folder: Path, scene: MovingScene) -> Layers | None:

@@ -160,8 +160,7 @@ def stage_of_solids(frames: Iterable[Frame], color_name: str, solids: Sequence[S
     rim = RIM * (high - low)
     least, most = np.minimum(low, centers.min(axis=0)) - rim, np.maximum(high, centers.max(axis=0)) + rim
     cut = [
-        replace(solid, vertices=np.clip(solid.vertices, least, most)) if solid.body < 0 else solid
-        for solid in solids
+        replace(solid, vertices=np.clip(solid.vertices, least, most)) if solid.body < 0 else solid for solid in solids
     ]
     hottest = max(float(np.concatenate(colors).max()), np.finfo(np.float64).tiny)
     return Stage(low, high, (0.0, hottest), color_name, tuple(cut))

@@ -6,6 +6,7 @@ import io
 import json
 import math
 import os
+import re
 import shutil
 import sqlite3
 from collections.abc import Callable, Mapping
@@ -599,6 +600,49 @@ def test_a_pair_that_was_never_measured_fails_the_check(gated: Mapping[str, Path
     result = call("check", *gate_arguments(gated, out=out))
     assert result.exit_code == 1
     assert "1 missing" in result.output
+
+
+def changed(out: Path, to: Path, statement: str) -> Path:
+    """A results folder like another one, but for what a statement changes."""
+    to.mkdir()
+    shutil.copy(out / FILE_NAME, to / FILE_NAME)
+    with sqlite3.connect(to / FILE_NAME) as connection:
+        connection.executescript(statement)
+    connection.close()
+    return to
+
+
+def test_two_results_folders_are_compared_in_either_direction(gated: Mapping[str, Path], tmp_path: Path) -> None:
+    assert "Nothing got worse" in call("compare", str(gated["out"]), str(gated["out"])).output
+    worse = changed(gated["out"], tmp_path / "worse", """
+        UPDATE scores SET value = 0.001
+        WHERE score = (SELECT min(score) FROM scores WHERE name = 'KIN' AND metric = 'energy gained')
+    """)  # fmt: skip
+    report = tmp_path / "compare.md"
+    result = call("compare", str(gated["out"]), str(worse), "--report", str(report))
+    assert result.exit_code == 1, result.output
+    assert re.search(r"1 of \d+ numbers got worse, most of all energy gained", " ".join(result.output.split()))
+    assert "results in" in report.read_text(encoding="utf-8")
+    result = call("compare", str(worse), str(gated["out"]))
+    assert result.exit_code == 0, result.output
+    assert "Got better" in result.output
+
+
+@pytest.mark.parametrize(
+    ("statement", "words"),
+    [
+        ("DELETE FROM scores; DELETE FROM series; DELETE FROM tasks", "no solver has an answer"),
+        ("UPDATE runs SET settings = replace(settings, '\"smoke\"', '\"default\"')", "of tier smoke, not default"),
+    ],
+)
+def test_results_that_cannot_be_compared_end_with_exit_code_2(
+    statement: str, words: str, gated: Mapping[str, Path], tmp_path: Path
+) -> None:
+    other = changed(gated["out"], tmp_path / "other", statement)
+    result = call("compare", str(gated["out"]), str(other))
+    assert result.exit_code == 2, result.output
+    assert words in " ".join(result.output.split())
+    assert call("compare", str(gated["out"]), str(tmp_path)).exit_code == 2
 
 
 @pytest.mark.parametrize(

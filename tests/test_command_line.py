@@ -27,8 +27,8 @@ from solvers import SOLVERS
 
 ROOT = Path(__file__).parent.parent
 COMMANDS = (
-    "accept", "bench", "check", "claims", "export", "figures", "list", "patterns", "replay", "run", "scorecard",
-    "simulate",
+    "accept", "bench", "check", "claims", "compare", "export", "figures", "list", "patterns", "replay", "run",
+    "scorecard", "simulate",
 )  # fmt: skip
 # Modules that `--help` must not wait for: each takes a tenth of a second or more.
 HEAVY = ("numpy", "scipy", "numba", "pandas", "matplotlib", "rich", "pebble")
