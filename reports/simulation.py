@@ -11,6 +11,7 @@ still-FRAME.png, simulation.mp4    pictures (the video with the extra `render`)
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from itertools import islice
 from pathlib import Path
 
 import matplotlib as mpl
@@ -146,7 +147,7 @@ def stages_markdown(scene: MovingScene, measures: Mapping[str, Floats]) -> str:
 def write_pictures(
     folder: Path, scene: MovingScene, *, video: bool, progress: Callable[[str], None]
 ) -> list[Path]:  # fmt: skip
-    """Draw stills of a simulation, and a video if it is wanted.
+    """Draw stills of a simulation, and a video if it is wanted; of a bed from when it lies, if the run got so far.
 
     Args:
         folder: with frames.
@@ -157,25 +158,31 @@ def write_pictures(
     Raises:
         ReportError: there is no frame, or a video is wanted without the extra `render`.
     """
-    count = sum(1 for _ in trajectory.read_frames(folder))
-    if not count:
+    late = [at_or_after(frame.time, scene.color_from) for frame in trajectory.read_frames(folder)]
+    if not late:
         raise ReportError(f"{folder} holds no frames")
+    first = late.index(True) if any(late) else 0
+
+    def drawn() -> Iterator[trajectory.Frame]:
+        return islice(trajectory.read_frames(folder), first, None)
+
+    count = len(late) - first
     paint, view = _painter(folder, scene), VIEWS.get(scene.trace, pictures.View())
-    painted = (paint(frame) for frame in trajectory.read_frames(folder))
-    if next(trajectory.read_frames(folder)).turn.size:
+    painted = (paint(frame) for frame in drawn())
+    if next(drawn()).turn.size:
         stage = pictures.stage_of_solids(painted, scene.color, solids_of(scene))
     else:
         stage = pictures.stage_of(painted, scene.color)
     wanted = set(np.linspace(0, count - 1, STILLS).round().astype(int))
     written = []
-    for k, frame in enumerate(trajectory.read_frames(folder)):
+    for k, frame in enumerate(drawn()):
         if k in wanted:
             path = folder / f"still-{k:05}.png"
             written.append(pictures.write_still(path, paint(frame), stage, view))
             progress(f"drew {path.name}")
     if video:
         every = -(-count // MOST_FRAMES)
-        frames = (paint(f) for k, f in enumerate(trajectory.read_frames(folder)) if k % every == 0)
+        frames = (paint(f) for k, f in enumerate(drawn()) if k % every == 0)
         progress(f"drawing {-(-count // every)} frames of a video")
         written.append(pictures.write_video(folder / "simulation.mp4", frames, stage, view))
     return written

@@ -21,6 +21,7 @@ from scenarios.world.rigid_bodies import RigidBody
 from scenarios.world.rigid_world import RigidSettings, RigidWorld, Trigger
 from scenarios.world.rotation import about
 from scenarios.world.shapes import ball, box, half_space
+from solvers.solution import Floats
 
 HALF_SIZES = (4.3828, 1.8995, 0.05)
 """Half length, width and thickness of a card [m], of the scene that Smith 2012 released."""
@@ -35,12 +36,17 @@ JOINT = 0.002
 # Gap between the two cards of a pair, and over all that carries, as a share of the length: they start as good as
 # touching, and overlap nowhere.
 START_GAP = 1e-6
-# Radius of a ball as a share of a card's length, and the height over the house from which it falls, in lengths.
-BALL, FALL = 0.15, 1.2
+# Radius of a ball as a share of a card's length, the height over the house from which it falls, in lengths, its density
+# over that of the cards, and how far to each side of the middle it falls: between the outer pairs of the lowest storey.
+BALL, FALL, HEAVY, BESIDE = 0.2, 0.6, 5.0, 1.0
+# A card that a ball flings away moves by more than half its thickness in a step; contacts are seen two steps ahead.
+LARGEST_MOVE = 1.8
+# A card that has moved by less than this share of its length is in its place.
+IN_PLACE = 0.1
 # The cards are at rest when this share of the peak of their kinetic energy is left.
 AT_REST = 1e-6
 STAGES = ("the balls are let go", "the cards are at rest")
-SOLVER = "qce-lcp:tolerance=1e-6,max_sweeps=500"
+SOLVER = "qce-lcp:tolerance=1e-6,max_sweeps=1000"
 
 
 def card_house(
@@ -147,27 +153,35 @@ def _build(
     radius = BALL * length
     top = max(float(np.asarray(card.position)[2]) for card in cards) + FALL * length
     ground = RigidBody("ground", half_space(), friction=friction, fixed=True)
-    # Beside the middle, on both sides and one after the other: nothing falls straight down.
-    places = [(0.3 * length, 0.2 * width, top), (-0.5 * length, -0.2 * width, top + 4.0 * radius)]
+    # On both sides, in front of and behind the middle plane, and one after the other.
+    beside = BESIDE * length
+    places = [(beside, 0.2 * width, top), (-beside, -0.2 * width, top + 4.0 * radius)]
     balls = [
-        RigidBody(f"ball {k}", ball(radius), place, friction=friction, held=True) for k, place in enumerate(places)
+        RigidBody(f"ball {k}", ball(radius), place, density=HEAVY, friction=friction, held=True)
+        for k, place in enumerate(places)
     ]
-    hit = hit_at + np.sqrt(2.0 * (FALL * length - radius) / GRAVITY)
+    # By then both would be on the ground if nothing were in their way.
+    hit = hit_at + np.sqrt(2.0 * (top + 4.0 * radius) / GRAVITY)
     # A card that falls by its own length has less energy than 24 of them that come down from three storeys.
     least_peak = GRAVITY * length * cards[0].shape.volume
     triggers = [
         Trigger(STAGES[0], lambda world: world.time >= hit_at, tuple(thrown.name for thrown in balls)),
         Trigger(STAGES[1], lambda world: world.time > hit and cards_energy(cards, world) < AT_REST * least_peak),
     ]
-    settings = RigidSettings(step=step, gravity=GRAVITY)
+    settings = RigidSettings(step=step, gravity=GRAVITY, largest_move=LARGEST_MOVE)
     return RigidWorld(identity, [ground, *cards, *balls], settings, resolver, triggers=triggers)
 
 
-def displacement(cards: Sequence[RigidBody], world: RigidWorld) -> float:
-    """How far the card that moved most is from its start [lengths of a card]; cards are the first movable bodies."""
+def displacements(cards: Sequence[RigidBody], world: RigidWorld) -> Floats:
+    """How far each card is from its start [lengths of a card]; cards are the first movable bodies."""
     start = np.array([np.asarray(card.position) for card in cards])
-    moved = np.linalg.norm(world.position[: len(cards)] - start, axis=1)
-    return float(moved.max() / np.ptp(cards[0].shape.vertices, axis=0).max())
+    moved: Floats = np.linalg.norm(world.position[: len(cards)] - start, axis=1)
+    return moved / float(np.ptp(cards[0].shape.vertices, axis=0).max())
+
+
+def displacement(cards: Sequence[RigidBody], world: RigidWorld) -> float:
+    """How far the card that moved most is from its start [lengths of a card]."""
+    return float(displacements(cards, world).max())
 
 
 def cards_energy(cards: Sequence[RigidBody], world: RigidWorld) -> float:
@@ -184,6 +198,7 @@ def _measures(cards: Sequence[RigidBody], world: MovingWorld) -> dict[str, float
     return {
         STAGES_FIRED: float(len(world.fired)),
         "largest displacement [card lengths]": displacement(cards, world),
+        "cards in their place": float((displacements(cards, world) < IN_PLACE).sum()),
         "height of the highest card [m]": float(world.position[: len(cards), 2].max()),
         "kinetic energy of the cards [J]": cards_energy(cards, world),
         "overlap [m]": world.overlap,

@@ -37,8 +37,8 @@ LONGEST_STEP = 0.0155
 """Time step of the patterns [√(D/g)]: 396 a cycle for hexagons, 557 for squares.
 
 A layer that lands is pressed together, the more the longer the step: `tests/benchmarks/test_bench_world.py` prints the
-deepest overlap by step. Zhang 2015 has 0.0002 s; with grains of 0.165 mm, as in the experiments of Bizon 1998, that
-were 0.049.
+deepest overlap of a step and of half of it. Zhang 2015 has 0.0002 s; with grains of 0.165 mm, as in the experiments of
+Bizon 1998, that were 0.049.
 """
 # Cycles between two frames of a pattern, 60,000 grains each; its measures are taken every cycle.
 FRAME_CYCLES = 10
@@ -77,6 +77,9 @@ def extended_pattern(
         steps_per_cycle: time steps in a period of the plate, ≥ 50; None: the fewest of at most `LONGEST_STEP`.
         restitution: of all contacts, in [0, 1]; None: e = max(1 - 0.3 v^(3/4), 0.7).
         friction: coefficient of all contacts, ≥ 0.
+
+    Unlike in Bizon 1998, a contact that sticks keeps no tangential velocity: the tangential restitution β₀ = 0.35 is
+    not modeled, as the friction of Zhang 2015 has none.
 
     Source: Bizon 1998; Zhang 2015, Fig. 9.
 

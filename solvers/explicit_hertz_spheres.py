@@ -1,20 +1,20 @@
 """Rounds of explicit Hertz impulses on packed spheres: elastic, without friction, one step for all, any threads.
 
 The law and its step are those of `solvers.explicit_hertz`. While gaps are remembered, or much presses, a step sweeps
-over all contacts, lists those that press, and goes over the list once more for Rowlands' shift. Contacts are cut into
-chunks such that those of one parity share no body: the chunks of a parity run at the same time, and what a body sums
-up has one order whoever does it. Once gaps are forgotten and little presses, only contacts of bodies that were pushed
-are looked at, on one thread.
+over all contacts, lists those that press, and goes over the list once more for Rowlands' shift. Its length follows what
+is left: a contact of approach speed V lasts V^((1-η)/(1+η)), and speeds fall with the root of the energy of approach
+and of compression. Contacts are cut into chunks such that those of one parity share no body: the chunks of a parity run
+at the same time, and what a body sums up has one order whoever does it. Once gaps are forgotten and little presses,
+only contacts of bodies that were pushed are looked at, on one thread.
 
 Stiffness is taken out: with rows k^(1/(η+1)) n in place of n, compressions and impulses by contact are those of k = 1,
-and the velocities of the bodies stay as they are.
+and the velocities of the bodies stay as they are. u, P and δ below are along these rows.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -22,7 +22,7 @@ import numpy.typing as npt
 from solvers._jit import alone, kernel, parallel_kernel, prange
 from solvers.problem import ImpactProblem
 from solvers.solution import Floats
-from solvers.sphere_rows import Indices, SphereRows, sphere_rows
+from solvers.sphere_rows import Indices, Ints, SphereRows
 
 # Unsigned as the indices of `sphere_rows`: no test for negative ones.
 Offsets = npt.NDArray[np.uint64]
@@ -42,36 +42,40 @@ MOST_CHUNKS = 64
 # A pressing contact pushes two bodies, which take part in five others each: with fewer pressing than one in so many,
 # contacts of pushed bodies are fewer than half of all.
 SPARSE = 24
+# What approach and compression hold, summed over contacts, in kinetic energies of bodies that all are the fastest: a
+# sphere has twelve contacts at most, and moves at twice that speed beside a floor that moves. Beyond is no impact.
+RUNAWAY = 100.0
+NO_FRICTION = np.zeros(0)
 # Numba makes a signed index of an unsigned one and a plain number, and tests it for being negative at every access.
-ONE, TWO, THREE = np.uint64(1), np.uint64(2), np.uint64(3)
+ONE, TWO, THREE, FOUR, FIVE = np.uint64(1), np.uint64(2), np.uint64(3), np.uint64(4), np.uint64(5)
 # A gap that closes after a wait is zero to the rounding of that wait.
 CLOSED = 1e-14
 
 
 @dataclass(frozen=True)
 class Spheres:
-    """Elastic contacts of spheres without spin, in units of the problem's own; kernels see flat, read-only arrays."""
+    """Elastic contacts of spheres without spin, in units of velocity V and inverse mass w; kernels see flat arrays."""
 
     rows: SphereRows
     """The problem packed; its normals and bodies are not those of the kernels."""
 
-    n: int
-    """Velocities of the problem."""
-
     v_pre: Floats
-    """Velocity of the bodies, then their inverse mass; one immovable body a chunk at the end; (bodies + chunks, 4)."""
+    """Velocity, then inverse mass of each body; one immovable body a chunk at the end; shape (4 (bodies + chunks),)."""
 
     normal: Floats
     """k^(1/(η+1)) n, shape (3m,)."""
 
     body: Indices
-    """Where the rows of bodies a and b begin in flat velocities, shape (2m,)."""
+    """Where the rows of bodies a and b begin in velocities, shape (2m,)."""
 
-    scale: Floats
-    """k^(1/(η+1)), shape (m,)."""
+    scale: Floats | None
+    """k^(1/(η+1)), shape (m,), 1 at the softest contact; None where all are 1."""
 
     rate: Floats
     """(W K W)_ii / W_ii, shape (m,)."""
+
+    inertia: float
+    """Mass by which approach counts as energy: 1 over the mean rate."""
 
     chunk: Offsets
     """Where the chunks of contacts begin, shape (chunks + 1,)."""
@@ -79,98 +83,197 @@ class Spheres:
     bodies_of_chunk: int
     """Bodies whose contacts a chunk takes."""
 
+    @property
+    def is_shared(self) -> bool:
+        """Whether threads share the work out."""
+        return self.rate.size >= SHARED_CONTACTS
+
+    @property
+    def friction_rows(self) -> int:
+        """Number of friction directions: there is no friction."""
+        return 0
+
     def relative_velocity(self, v: Floats) -> Floats:
-        """Normal relative velocities at a velocity of the bodies, shape (m,)."""
-        return _relative_velocity(self.normal, self.body, v.reshape(-1)) / self.scale
+        """Relative velocities along the rows at a velocity of the bodies, shape (m,)."""
+        nothing = np.zeros(self.rate.size)
+        return self.outcome(v, v, nothing, nothing, NO_FRICTION)[0]
 
-    def slip(self, v: Floats) -> Floats:
-        """Nothing slips: there is no friction."""
-        return np.zeros(0)
+    def outcome(self, v: Floats, v_end: Floats, u: Floats, P: Floats, P_t: Floats) -> tuple[Floats, float, float]:
+        """Relative velocities after impulses that take u to them, and the energy of αP: α a + ½ α² b.
 
-    def in_problem_order(self, v: Floats, P: Floats) -> tuple[Floats, Floats]:
-        """Velocity, shape (n,), and impulse, shape (m,), as the problem orders them."""
-        velocity = self.rows.velocity_in_problem_order(v[: self.rows.V.shape[0]], self.n)
-        return velocity, self.rows.in_problem_order(P)
+        Returns:
+            Relative velocities, shape (m,), a, b.
+        """
+        run = _powers if self.is_shared else _powers_alone
+        u_end, power = run(self.chunk, self.normal, self.body, v_end, P, u)
+        return u_end, float(power[:, 0].sum()), float(power[:, 1].sum())
+
+    def in_problem_order(self, v: Floats, P: Floats, *, n: int, V: float, w: float) -> tuple[Floats, Floats]:
+        """Velocity, shape (n,), and impulse, shape (m,), in the problem's order and units."""
+        run = _in_problem_order if self.is_shared else _in_problem_order_alone
+        P = P if self.scale is None else P * self.scale
+        return run(v, P, self.rows.owner, self.rows.contact, n, V, V / w)
 
     @cached_property
     def contacts_of_body(self) -> tuple[Indices, Indices]:
         """Where the contacts of each movable body begin, shape (bodies + 1,), and these contacts."""
-        return _contacts_of_body(self.body, self.v_pre.shape[0] - self.chunk.size + 1)
+        return _contacts_of_body(self.body, self.rows.owner.size - 1)
+
+    @cached_property
+    def pushed(self) -> Floats:
+        """Room for what the pushes of a step add to the velocities, beside the inverse masses; shape of `v_pre`."""
+        return self.v_pre.copy()
 
     def integrate(
-        self, v: Floats, *, exponent: float, h: float, gap_memory: float, threshold: float, slowest: float,
+        self, v: Floats, u: Floats, *, exponent: float, h: float, gap_memory: float, threshold: float, slowest: float,
         max_steps: int, max_visits: int,
     ) -> tuple[Floats, Floats, Floats, float, int, int, bool]:  # fmt: skip
-        """One round from v; gap_memory = 1 remembers nothing.
+        """One round from v, where the relative velocities are u; gap_memory = 1 remembers nothing.
 
         Returns:
             Velocity, impulse, friction impulse (none), energy that friction took (0), steps, contact visits, finished.
         """
         v = v.copy()
-        V = v.reshape(-1)
-        P = np.zeros(self.rate.size)
-        compression = np.zeros(self.rate.size)
-        steps, visits, finished = 0, 0, False
+        P = np.zeros(u.size)
+        compression = np.zeros(u.size)
+        pressing = np.empty(u.size, np.uint32)
+        dv = self.pushed
+        _clear(0, dv.size // 4, dv)
+        steps, visits, finished = 0, u.size, False
         if gap_memory < 1.0:
-            sweep = _sweep if P.size >= SHARED_CONTACTS else _sweep_alone
-            steps, visits, finished = sweep(
-                self.chunk, self.bodies_of_chunk, self.normal, self.body, 1.0 / self.rate.mean(), exponent, h,
-                gap_memory, threshold, slowest, max_steps, max_visits, V, P, compression,
+            run = _sweep if self.is_shared else _sweep_alone
+            steps, visits, finished, n_pressing, h = run(
+                self.chunk, self.bodies_of_chunk, self.normal, self.body, self.inertia, exponent, h,
+                gap_memory, threshold, slowest, max_steps, max_visits, v, dv, P, compression, pressing,
             )  # fmt: skip
-        if not finished:
+        else:
+            n_pressing = _approaching(u, slowest, pressing)
+        if not finished and n_pressing > 0:
             more, seen, finished = _follow(
                 *self.contacts_of_body, self.normal, self.body, exponent, h, slowest, max_steps - steps,
-                max_visits - visits, V, P, compression,
+                max_visits - visits, n_pressing, v, dv, P, compression, pressing,
             )  # fmt: skip
             steps += more
             visits += seen
-        return v, P * self.scale, np.zeros(0), 0.0, steps, visits, finished
+        return v, P, NO_FRICTION, 0.0, steps, visits, finished
 
 
 def spheres(problem: ImpactProblem, stiffness: Floats, *, exponent: float, V: float, w: float) -> Spheres | None:
     """Pack an elastic problem in units of velocity V and inverse mass w; None where it has another form."""
-    rows = sphere_rows(problem) if problem.m >= PACKED_CONTACTS else None
-    if rows is None or problem.m < LAYERED * (rows.V.shape[0] - 1):
+    rows = problem.spheres_at_rest if problem.m >= PACKED_CONTACTS else None
+    if rows is None or problem.m < LAYERED * (rows.owner.size - 1):
         return None
-    bodies = rows.V.shape[0] - 1
-    chunk, bodies_of_chunk = _chunks(rows.body, bodies)
-    v_pre = np.zeros((bodies + chunk.size - 1, 4))
-    v_pre[:bodies, :3] = rows.V[:-1, :3] / V
-    v_pre[:bodies, 3] = rows.V[:-1, 3] / w
-    # All are 1 where all are alike; a power costs as much as a sweep.
-    alike = bool((stiffness == 1.0).all())
-    stiffness = stiffness if alike else stiffness[rows.contact]
-    scale = stiffness if alike else stiffness ** (1.0 / (exponent + 1.0))
-    rate = _rates(rows.normal, rows.body, v_pre, stiffness)
+    chunk, size = _chunks(rows.body, rows.owner.size - 1)
+    shared = problem.m >= SHARED_CONTACTS
+    in_packed_order, rates = (_in_packed_order, _rates) if shared else (_in_packed_order_alone, _rates_alone)
+    v_pre = in_packed_order(problem.v_pre, rows.owner, rows.V, chunk.size - 1, V, w)
+    body = _places(rows.body, rows.owner.size - 1, chunk)
+    softest = float(stiffness.min())
+    # A power costs as much as a sweep.
+    alike = softest == stiffness.max()
+    # In units of the softest: no row is shorter than its normal, so that none approaches faster than its row says.
+    stiffness = stiffness if alike else stiffness[rows.contact] / softest
+    scale = None if alike else stiffness ** (1.0 / (exponent + 1.0))
+    rate, total = rates(chunk, rows.normal.reshape(-1), body, v_pre, stiffness)
     if (rate.max() / rate.min()) ** (1.0 / (exponent + 1.0)) > PACKED_SPREAD:
         return None
-    # Threads must not push the floor together: it gets a number for each chunk.
-    number = np.repeat(np.arange(bodies, bodies + chunk.size - 1, dtype=np.uint32), np.diff(chunk).astype(np.int64))
-    body = np.uint32(4) * np.where(rows.body == bodies, number[:, None], rows.body)
-    normal = rows.normal.view() if alike else rows.normal * scale[:, None]
-    return Spheres(rows, problem.n, v_pre, _read_only(normal), _read_only(body), scale, rate, chunk, bodies_of_chunk)
-
-
-Entry = TypeVar("Entry", np.float64, np.uint32)
-
-
-def _read_only(array: npt.NDArray[Entry]) -> npt.NDArray[Entry]:
-    """Flatten an array of this file and freeze it: a kernel is compiled for one kind of array."""
-    flat = array.reshape(-1)
-    flat.flags.writeable = False
-    return flat
+    normal = rows.normal.reshape(-1) if scale is None else (rows.normal * scale[:, None]).reshape(-1)
+    # A kernel is compiled for one kind of array.
+    for array in (normal, body):
+        array.flags.writeable = False
+    return Spheres(rows, v_pre, normal, body, scale, rate, rate.size / float(total.sum()), chunk, size)
 
 
 def _chunks(body: Indices, bodies: int) -> tuple[Offsets, int]:
     """Cut contacts, sorted by their lower-numbered body, so that a chunk reaches into the next one's bodies at most."""
-    low = np.minimum(body[:, 0], body[:, 1])
-    high = np.maximum(body[:, 0], body[:, 1])
-    reach = int((high - low)[high < bodies].max(initial=1))
-    if (low[1:] < low[:-1]).any():
-        reach = bodies
-    size = max(reach, -(-bodies // MOST_CHUNKS))
-    count = -(-bodies // size)
-    return np.searchsorted(low, size * np.arange(count + 1)).astype(np.uint64), size
+    size = max(int(_reach(body, bodies)), -(-bodies // MOST_CHUNKS))
+    return _cuts(body, size, -(-bodies // size)), size
+
+
+@kernel
+def _reach(body: Indices, bodies: int) -> np.uint32:
+    """How much higher one movable body of a contact is numbered than the other, at most; all where not sorted."""
+    reach = np.uint32(1)
+    last = np.uint32(0)
+    for i in range(body.shape[0]):
+        low = min(body[i, 0], body[i, 1])
+        high = max(body[i, 0], body[i, 1])
+        if low < last:
+            return np.uint32(bodies)
+        last = low
+        if high < bodies:
+            reach = max(reach, high - low)
+    return reach
+
+
+@kernel
+def _cuts(body: Indices, size: int, count: int) -> Offsets:
+    """Where the contacts of each `size` bodies begin, shape (count + 1,), by bisection."""
+    chunk = np.zeros(count + 1, np.uint64)
+    chunk[count] = body.shape[0]
+    for c in range(1, count):
+        low = chunk[c - 1]
+        high = chunk[count]
+        while low < high:
+            middle = (low + high) >> ONE
+            if min(body[middle, 0], body[middle, 1]) < c * size:
+                low = middle + ONE
+            else:
+                high = middle
+        chunk[c] = low
+    return chunk
+
+
+@kernel
+def _places(body: Indices, bodies: int, chunk: Offsets) -> Indices:
+    """Where the rows of bodies begin in velocities, shape (2m,); each chunk has a floor of its own.
+
+    Threads must not push the same floor.
+    """
+    place = np.empty(2 * body.shape[0], np.uint32)
+    for c in range(chunk.size - 1):
+        floor = np.uint32(4 * (bodies + c))
+        for i in range(chunk[c], chunk[c + 1]):
+            for side in range(2):
+                b = body[i, side]
+                place[2 * i + side] = floor if b == bodies else 4 * b
+    return place
+
+
+@parallel_kernel
+def _in_packed_order(v: Floats, owner: Ints, at_rest: Floats, chunks: int, V: float, w: float) -> Floats:
+    """Velocities over V and inverse masses over w of packed bodies, then a floor for each chunk."""
+    bodies = owner.size - 1
+    width = v.size // bodies
+    packed = np.zeros(4 * (bodies + chunks))
+    for k in prange(bodies):
+        for axis in range(width):
+            packed[4 * k + axis] = v[owner[k] * width + axis] / V
+        packed[4 * k + 3] = at_rest[k, 3] / w
+    return packed
+
+
+_in_packed_order_alone = alone(_in_packed_order)
+
+
+@parallel_kernel
+def _in_problem_order(
+    v: Floats, P: Floats, owner: Ints, contact: Ints, n: int, speed: float, momentum: float
+) -> tuple[Floats, Floats]:
+    """Velocities times a speed, and impulses times a momentum, as the problem orders them."""
+    bodies = owner.size - 1
+    width = n // bodies
+    velocity = np.empty(n)
+    for k in prange(bodies):
+        for axis in range(width):
+            velocity[owner[k] * width + axis] = speed * v[4 * k + axis]
+    impulse = np.empty(P.size)
+    for i in prange(P.size):
+        impulse[contact[i]] = momentum * P[i]
+    return velocity, impulse
+
+
+_in_problem_order_alone = alone(_in_problem_order)
 
 
 @kernel
@@ -192,46 +295,105 @@ def _contacts_of_body(body: Indices, bodies: int) -> tuple[Indices, Indices]:
 
 
 @kernel
-def _relative_velocity(normal: Floats, body: Indices, V: Floats) -> Floats:
-    """Relative velocities n · (v_b - v_a) along the rows, shape (m,)."""
-    u = np.empty(body.size // 2)
-    for i in range(u.size):
-        a, b = body[TWO * i], body[TWO * i + ONE]
-        u[i] = (
-            normal[THREE * i] * (V[b] - V[a]) + normal[THREE * i + ONE] * (V[b + ONE] - V[a + ONE])
-            + normal[THREE * i + TWO] * (V[b + TWO] - V[a + TWO])
-        )  # fmt: skip
-    return u
+def _speed(normal: Floats, body: Indices, i: int | np.uint64, V: Floats) -> float:
+    """Relative velocity n · (v_b - v_a) along row i."""
+    a, b = body[TWO * i], body[TWO * i + ONE]
+    return float(
+        normal[THREE * i] * (V[b] - V[a]) + normal[THREE * i + ONE] * (V[b + ONE] - V[a + ONE])
+        + normal[THREE * i + TWO] * (V[b + TWO] - V[a + TWO])
+    )  # fmt: skip
+
+
+@parallel_kernel
+def _powers(chunk: Offsets, normal: Floats, body: Indices, V: Floats, P: Floats, u: Floats) -> tuple[Floats, Floats]:
+    """Relative velocities at V, shape (m,); first and second order of the energy of P by chunk, shape (chunks, 2)."""
+    u_end = np.empty(P.size)
+    power = np.empty((chunk.size - 1, 2))
+    for c in prange(chunk.size - 1):
+        power[c, 0], power[c, 1] = _powers_of_chunk(chunk[c], chunk[c + 1], normal, body, V, P, u, u_end)
+    return u_end, power
+
+
+_powers_alone = alone(_powers)
 
 
 @kernel
-def _rates(normal: Floats, body: Indices, V: Floats, stiffness: Floats) -> Floats:
-    """(W K W)_ii / W_ii by one tensor Σ k n nᵀ a body; between two bodies that meet once."""
-    tensor = np.zeros((V.shape[0], 6))
-    for i in range(body.shape[0]):
-        n0, n1, n2, k = normal[i, 0], normal[i, 1], normal[i, 2], stiffness[i]
-        for side in range(2):
-            c = body[i, side]
-            tensor[c, 0] += k * n0 * n0
-            tensor[c, 1] += k * n1 * n1
-            tensor[c, 2] += k * n2 * n2
-            tensor[c, 3] += 2.0 * k * n0 * n1
-            tensor[c, 4] += 2.0 * k * n0 * n2
-            tensor[c, 5] += 2.0 * k * n1 * n2
-    rate = np.empty(body.shape[0])
-    for i in range(body.shape[0]):
-        n0, n1, n2 = normal[i, 0], normal[i, 1], normal[i, 2]
+def _powers_of_chunk(
+    begin: np.uint64, end: np.uint64, normal: Floats, body: Indices, V: Floats, P: Floats, u: Floats, u_end: Floats
+) -> tuple[float, float]:
+    """Fill in a chunk's relative velocities, and sum.
+
+    The sums keep the compiler from gathering by vectors, which processors guard against leaks at four times the time.
+    """
+    a = 0.0
+    b = 0.0
+    for i in range(begin, end):
+        u_end[i] = _speed(normal, body, i, V)
+        a += P[i] * u[i]
+        b += P[i] * (u_end[i] - u[i])
+    return a, b
+
+
+@parallel_kernel
+def _rates(
+    chunk: Offsets, normal: Floats, body: Indices, V: Floats, stiffness: Floats
+) -> tuple[Floats, Floats]:  # fmt: skip
+    """(W K W)_ii / W_ii by one tensor Σ k n nᵀ a body, between two bodies that meet once; and their sum by chunk."""
+    chunks = chunk.size - 1
+    tensor = np.zeros(2 * V.size)
+    for parity in range(2):
+        for half in prange((chunks + 1 - parity) // 2):
+            c = 2 * half + parity
+            _add_tensors(chunk[c], chunk[c + 1], normal, body, stiffness, tensor)
+    rate = np.empty(stiffness.size)
+    total = np.empty(chunks)
+    for c in prange(chunks):
+        total[c] = _rates_of_chunk(chunk[c], chunk[c + 1], normal, body, stiffness, tensor, V, rate)
+    return rate, total
+
+
+_rates_alone = alone(_rates)
+
+
+@kernel
+def _add_tensors(
+    begin: np.uint64, end: np.uint64, normal: Floats, body: Indices, stiffness: Floats, tensor: Floats
+) -> None:
+    """Add k n nᵀ of a chunk's contacts to the tensors of their two bodies, eight places each."""
+    for i in range(begin, end):
+        n0, n1, n2, k = normal[THREE * i], normal[THREE * i + ONE], normal[THREE * i + TWO], stiffness[i]
+        for side in range(np.uint64(2)):
+            c = TWO * body[TWO * i + side]
+            tensor[c] += k * n0 * n0
+            tensor[c + ONE] += k * n1 * n1
+            tensor[c + TWO] += k * n2 * n2
+            tensor[c + THREE] += 2.0 * k * n0 * n1
+            tensor[c + FOUR] += 2.0 * k * n0 * n2
+            tensor[c + FIVE] += 2.0 * k * n1 * n2
+
+
+@kernel
+def _rates_of_chunk(
+    begin: np.uint64, end: np.uint64, normal: Floats, body: Indices, stiffness: Floats, tensor: Floats, V: Floats,
+    rate: Floats,
+) -> float:  # fmt: skip
+    """Fill in a chunk's rates and sum (see `_powers_of_chunk`)."""
+    total = 0.0
+    for i in range(begin, end):
+        n0, n1, n2 = normal[THREE * i], normal[THREE * i + ONE], normal[THREE * i + TWO]
         square = n0 * n0 + n1 * n1 + n2 * n2
-        total = 2.0 * V[body[i, 0], 3] * V[body[i, 1], 3] * stiffness[i] * square * square
-        for side in range(2):
-            c = body[i, side]
-            inverse_mass = V[c, 3]
-            total += inverse_mass * inverse_mass * (
-                tensor[c, 0] * n0 * n0 + tensor[c, 1] * n1 * n1 + tensor[c, 2] * n2 * n2
-                + tensor[c, 3] * n0 * n1 + tensor[c, 4] * n0 * n2 + tensor[c, 5] * n1 * n2
+        for_a, for_b = V[body[TWO * i] + THREE], V[body[TWO * i + ONE] + THREE]
+        square_of_row = 2.0 * for_a * for_b * stiffness[i] * square * square
+        for side in range(np.uint64(2)):
+            c = TWO * body[TWO * i + side]
+            w = V[body[TWO * i + side] + THREE]
+            square_of_row += w * w * (
+                tensor[c] * n0 * n0 + tensor[c + ONE] * n1 * n1 + tensor[c + TWO] * n2 * n2
+                + tensor[c + THREE] * n0 * n1 + tensor[c + FOUR] * n0 * n2 + tensor[c + FIVE] * n1 * n2
             )  # fmt: skip
-        rate[i] = total / ((V[body[i, 0], 3] + V[body[i, 1], 3]) * square)
-    return rate
+        rate[i] = square_of_row / ((for_a + for_b) * square)
+        total += rate[i]
+    return total
 
 
 @kernel
@@ -264,12 +426,7 @@ def _shifted(
     normal: Floats, body: Indices, i: np.uint64, compression: float, h: float, exponent: float, dv: Floats
 ) -> float:
     """Impulse of a step by Rowlands' shift, where all impulses of the unshifted force add dv."""
-    a, b = body[TWO * i], body[TWO * i + ONE]
-    w = (
-        normal[THREE * i] * (dv[b] - dv[a]) + normal[THREE * i + ONE] * (dv[b + ONE] - dv[a + ONE])
-        + normal[THREE * i + TWO] * (dv[b + TWO] - dv[a + TWO])
-    )  # fmt: skip
-    return h * _force(max(compression - h / 12.0 * w, 0.0), exponent)
+    return h * _force(max(compression - h / 12.0 * _speed(normal, body, i, dv), 0.0), exponent)
 
 
 @kernel
@@ -282,11 +439,7 @@ def _press(
     approach = 0.0
     count = np.uint64(begin)
     for i in range(begin, end):
-        a, b = body[TWO * i], body[TWO * i + ONE]
-        u = (
-            normal[THREE * i] * (V[b] - V[a]) + normal[THREE * i + ONE] * (V[b + ONE] - V[a + ONE])
-            + normal[THREE * i + TWO] * (V[b + TWO] - V[a + TWO])
-        )  # fmt: skip
+        u = _speed(normal, body, i, V)
         deep = compression[i]
         if remembers:
             deep -= h * u
@@ -333,16 +486,17 @@ def _clear(begin: int, end: int, dv: Floats) -> None:
 @kernel
 def _close_next_gap(normal: Floats, body: Indices, V: Floats, threshold: float, compression: Floats) -> bool:
     """Nothing presses: let the time pass until the next gap closes; false where none does."""
-    u = _relative_velocity(normal, body, V)
     wait = np.inf
-    for i in range(u.size):
-        if u[i] < -threshold:
-            wait = min(wait, max(compression[i] / u[i], 0.0))
+    for i in range(np.uint64(compression.size)):
+        u = _speed(normal, body, i, V)
+        if u < -threshold:
+            wait = min(wait, max(compression[i] / u, 0.0))
     if wait == np.inf:
         return False
-    for i in range(u.size):
-        compression[i] -= u[i] * wait
-        if abs(compression[i]) <= CLOSED * abs(u[i]) * wait:
+    for i in range(np.uint64(compression.size)):
+        u = _speed(normal, body, i, V)
+        compression[i] -= u * wait
+        if abs(compression[i]) <= CLOSED * abs(u) * wait:
             compression[i] = 0.0
     return True
 
@@ -350,23 +504,22 @@ def _close_next_gap(normal: Floats, body: Indices, V: Floats, threshold: float, 
 @parallel_kernel
 def _sweep(
     chunk: Offsets, size: int, normal: Floats, body: Indices, inertia: float,
-    exponent: float, h: float, gap_memory: float, threshold: float, slowest: float, max_steps: int, max_visits: int,
-    V: Floats, P: Floats, compression: Floats,
-) -> tuple[int, int, bool]:  # fmt: skip
-    """Steps over all contacts until gaps are forgotten and little presses; changes V, P and compression.
+    exponent: float, shortest: float, gap_memory: float, threshold: float, slowest: float, max_steps: int,
+    max_visits: int, V: Floats, dv: Floats, P: Floats, compression: Floats, pressing: Indices,
+) -> tuple[int, int, bool, int, float]:  # fmt: skip
+    """Steps over all contacts until gaps are forgotten and little presses; changes V, P, compression and pressing.
 
     Returns:
-        Steps, contact visits, finished.
+        Steps, contact visits, finished; how many contacts press and are listed, and the length of the next step.
     """
     m = P.size
     chunks = chunk.size - 1
-    pressing = np.zeros(m, np.uint32)
-    # What the unshifted pushes of a step add to V.
-    dv = V.copy()
-    _clear(0, dv.size // 4, dv)
     # Where the lists of the chunks end.
     end = chunk.copy()
     left_in = np.zeros(chunks)
+    energy = _energy_at_most(V)
+    growth = 0.5 * (exponent - 1.0) / (exponent + 1.0)
+    h = shortest
     remembers = True
     peak = 0.0
     steps = 0
@@ -386,9 +539,11 @@ def _sweep(
             left += left_in[c]
             n_pressing += int(end[c] - chunk[c])
         visits += m + n_pressing
-        if n_pressing == 0 and remembers:
-            if not _close_next_gap(normal, body, V, threshold, compression):
-                return steps, visits, True
+        if not left <= RUNAWAY * energy:
+            break
+        if n_pressing == 0:
+            if not remembers or not _close_next_gap(normal, body, V, threshold, compression):
+                return steps, visits, True, 0, h
             visits += m
             continue
         for parity in range(2):
@@ -400,82 +555,102 @@ def _sweep(
                     _clear(c * size, (c + 2) * size, dv)
                 elif c == 0:
                     _clear(0, size, dv)
-        peak = max(peak, left)
-        remembers = remembers and left >= gap_memory * gap_memory * peak
         if not remembers and SPARSE * n_pressing < m:
-            break
-    return steps, visits, False
+            n_pressing = 0
+            for c in range(chunks):
+                for q in range(chunk[c], end[c]):
+                    pressing[n_pressing] = pressing[q]
+                    n_pressing += 1
+            return steps, visits, False, n_pressing, h
+        if remembers:
+            peak = max(peak, left)
+            h = shortest * (peak / left) ** growth
+            remembers = left >= gap_memory * gap_memory * peak
+    return steps, visits, False, 0, h
 
 
 _sweep_alone = alone(_sweep)
 
 
 @kernel
+def _energy_at_most(V: Floats) -> float:
+    """Kinetic energy if all movable bodies had the speed of the fastest body, whether that can be moved or not."""
+    fastest = 0.0
+    mass = 0.0
+    for k in range(0, V.size, 4):
+        fastest = max(fastest, V[k] * V[k] + V[k + 1] * V[k + 1] + V[k + 2] * V[k + 2])
+        if V[k + 3] > 0.0:
+            mass += 1.0 / V[k + 3]
+    return 0.5 * mass * fastest
+
+
+@kernel
+def _approaching(u: Floats, slowest: float, contacts: Indices) -> int:
+    """List contacts that approach faster than the slowest; returns how many."""
+    count = 0
+    for i in range(u.size):
+        contacts[count] = i
+        count += u[i] < -slowest
+    return count
+
+
+@kernel
 def _follow(
     first: Indices, contact: Indices, normal: Floats, body: Indices,
-    exponent: float, h: float, slowest: float, max_steps: int, max_visits: int,
-    V: Floats, P: Floats, compression: Floats,
+    exponent: float, h: float, slowest: float, max_steps: int, max_visits: int, n_pressing: int,
+    V: Floats, dv: Floats, P: Floats, compression: Floats, pressing: Indices,
 ) -> tuple[int, int, bool]:  # fmt: skip
     """Steps without gaps over the contacts of pushed bodies, until none presses; changes V, P and compression.
 
     Returns:
         Steps, contact visits, finished.
     """
-    m = P.size
-    dv = V.copy()
-    _clear(0, dv.size // 4, dv)
-    # Contacts to look at, those of them that press, and the bodies that these push.
-    watched = np.empty(m, np.uint32)
-    pressing = np.empty(m, np.uint32)
+    # Contacts to look at, and the bodies that those which press push; both are marked while they are listed.
+    watched = np.empty(P.size, np.uint32)
     pushed = np.empty(first.size, np.uint32)
-    seen = np.zeros(m, np.int32)
-    moved = np.zeros(first.size, np.int32)
-    u = _relative_velocity(normal, body, V)
-    n_watched = 0
-    for i in range(m):
-        watched[n_watched] = i
-        n_watched += (compression[i] > 0.0) | (u[i] < -slowest)
-    visits = m
-    for step in range(1, max_steps + 1):
+    seen = np.zeros(P.size, np.bool_)
+    moved = np.zeros(first.size, np.bool_)
+    visits = 0
+    for step in range(max_steps):
         if visits >= max_visits:
-            return step - 1, visits, False
-        n_pressing = 0
+            return step, visits, False
         n_pushed = 0
+        for c in range(n_pressing):
+            j = np.uint64(pressing[c])
+            for side in range(2):
+                k = body[TWO * j + np.uint64(side)] >> 2
+                if k + 1 < first.size and not moved[k]:
+                    moved[k] = True
+                    pushed[n_pushed] = k
+                    n_pushed += 1
+        n_watched = 0
+        for c in range(n_pushed):
+            k = pushed[c]
+            moved[k] = False
+            _clear(k, k + 1, dv)
+            for q in range(first[k], first[k + 1]):
+                i = contact[q]
+                if not seen[i]:
+                    seen[i] = True
+                    watched[n_watched] = i
+                    n_watched += 1
+        n_pressing = 0
         for c in range(n_watched):
             j = np.uint64(watched[c])
-            a, b = body[TWO * j], body[TWO * j + ONE]
-            u_i = (
-                normal[THREE * j] * (V[b] - V[a]) + normal[THREE * j + ONE] * (V[b + ONE] - V[a + ONE])
-                + normal[THREE * j + TWO] * (V[b + TWO] - V[a + TWO])
-            )  # fmt: skip
-            starts = (compression[j] > 0.0) | (u_i < -slowest)
-            compression[j] = max(max(compression[j], 0.0) - h * u_i, 0.0) if starts else 0.0
+            seen[j] = False
+            u = _speed(normal, body, j, V)
+            starts = (compression[j] > 0.0) | (u < -slowest)
+            compression[j] = max(max(compression[j], 0.0) - h * u, 0.0) if starts else 0.0
             if compression[j] > 0.0:
                 pressing[n_pressing] = j
                 n_pressing += 1
                 _push(normal, body, j, h * _force(compression[j], exponent), dv)
-                for side in range(2):
-                    k = body[TWO * j + np.uint64(side)] >> 2
-                    if k + 1 < first.size and moved[k] != step:
-                        moved[k] = step
-                        pushed[n_pushed] = k
-                        n_pushed += 1
         visits += n_watched + n_pressing
         if n_pressing == 0:
-            return step, visits, True
+            return step + 1, visits, True
         for c in range(n_pressing):
             j = np.uint64(pressing[c])
             kick = _shifted(normal, body, j, compression[j], h, exponent, dv)
             P[j] += kick
             _push(normal, body, j, kick, V)
-        n_watched = 0
-        for c in range(n_pushed):
-            k = pushed[c]
-            _clear(k, k + 1, dv)
-            for q in range(first[k], first[k + 1]):
-                i = contact[q]
-                if seen[i] != step:
-                    seen[i] = step
-                    watched[n_watched] = i
-                    n_watched += 1
     return max_steps, visits, False

@@ -7,6 +7,10 @@ v follows every step, so that a visit touches the velocities of one contact and 
 forms: packed where the problem is of spheres (`sphere_rows`: 32 bytes a contact, neighbors in space are neighbors in
 memory), CSR otherwise. Tangents are CSR over the same velocities, as spin may make their rows long.
 
+With friction sweeps may creep (see `proximal_newton`): what the first `FIRST` of them do not solve goes on in proximal
+steps where the problem is small enough, with a sweep after each, which measures it. An iteration of Newton's counts as
+a sweep. What ends early is cut to the share with which no kinetic energy is gained.
+
 Sources: Zhang 2015, Eq. 20-21; Stewart 1996; Tonge 2012.
 """
 
@@ -18,6 +22,7 @@ import scipy.sparse as sp
 
 from solvers._jit import kernel
 from solvers.problem import ImpactProblem, Matrix
+from solvers.proximal_newton import ITERATIONS, Elimination, eliminate, proximal_step
 from solvers.solution import Floats
 from solvers.sphere_rows import SphereRows, sphere_rows
 
@@ -29,6 +34,15 @@ Indices = npt.NDArray[np.uint32]
 REFRESH = 64
 # Packing a smaller problem takes longer than it saves.
 PACKED = 200
+# Sweeps before the first proximal step: most problems need no more.
+FIRST = 20
+# ε of the first proximal step, and its bounds: rounding below, hardly more than a sweep above.
+START, SMALLEST, LARGEST = 1e-4, 1e-7, 0.1
+# Sweeps and Newton's iterations from one start.
+NEWTON = 150
+# Shares of λ and λ_f of the first sweeps from which the steps start, one after the other until one ends: with friction
+# some problems have solutions that iterations turn away from, and others that they find.
+STARTS = ((1.0, 1.0), (0.0, 0.0), (1.0, 0.0), (10.0, 0.0), (0.5, 0.5), (100.0, 0.0))
 # Packed velocities: three entries of a body, then its inverse mass.
 STRIDE = 4
 MASS = 3
@@ -52,13 +66,84 @@ def sweep(
         impulse: first guess of λ [N s], shape (m,), ≥ 0.
         friction_impulse: first guess of λ_f [N s], shape (2m,), within its bounds.
         tolerance: natural map at which to stop [m/s].
-        max_sweeps: bound on sweeps over normals and tangents.
-        max_visits: bound on row visits; the sweep in progress is finished.
+        max_sweeps: bound on sweeps over normals and tangents, and Newton's iterations.
+        max_visits: bound on row visits, and products of blocks; the sweep in progress is finished.
 
     Returns:
         impulse, friction impulse [N s], velocity [m/s, rad/s], sweeps, row visits, natural map [m/s].
     """
+    found, found_friction = impulse.copy(), friction_impulse.copy()
+    first = min(max_sweeps, FIRST) if problem.has_friction else max_sweeps
     rows = sphere_rows(problem) if problem.m >= PACKED else None
+    v, sweeps, visits, residual = _swept(problem, target, found, found_friction, rows, tolerance, first, max_visits)
+    elimination = eliminate(problem) if residual > tolerance and first < max_sweeps else None
+    if elimination is not None:
+        begin, begin_friction = found.copy(), found_friction.copy()
+        for share, friction_share in STARTS:
+            trial, trial_friction = share * begin, friction_share * begin_friction
+            trial_v, sweeps, visits, left = _proximal_steps(
+                problem, elimination, target, trial, trial_friction, sweeps, visits, tolerance, max_sweeps, max_visits
+            )
+            if left < residual:
+                found, found_friction, v, residual = trial, trial_friction, trial_v, left
+            if residual <= tolerance:
+                break
+    if residual > tolerance and sweeps < max_sweeps and visits < max_visits:
+        v, more, more_visits, residual = _swept(
+            problem, target, found, found_friction, rows, tolerance, max_sweeps - sweeps, max_visits - visits
+        )
+        sweeps, visits = sweeps + more, visits + more_visits
+    if residual > tolerance and problem.has_friction:
+        share = _share_without_gain(problem, found, found_friction, v)
+        if share < 1.0:
+            found, found_friction = share * found, share * found_friction
+            v, _, _, residual = _swept(problem, target, found, found_friction, rows, tolerance, 0, max_visits)
+    return found, found_friction, v, sweeps, visits, residual
+
+
+def _share_without_gain(problem: ImpactProblem, impulse: Floats, friction_impulse: Floats, v: Floats) -> float:
+    """Share of impulses that ended early, ≤ 1, with which no kinetic energy is gained.
+
+    The change is s p·u + ½ s² p·W p at the share s, with u before and u + W p after the whole impulse.
+    """
+    tangents = problem.DM if problem.D is None else problem.D
+    before = float(impulse @ problem.u_pre + friction_impulse @ (tangents @ problem.v_pre))
+    after = float(impulse @ (problem.J @ v) + friction_impulse @ (tangents @ v))
+    gained = before + after > 0.0 > before
+    return -2.0 * before / (after - before) if gained else 1.0
+
+
+def _proximal_steps(
+    problem: ImpactProblem, elimination: Elimination, target: Floats, impulse: Floats, friction_impulse: Floats,
+    sweeps: int, visits: int, tolerance: float, max_sweeps: int, max_visits: int,
+) -> tuple[Floats, int, int, float]:  # fmt: skip
+    """Proximal steps from given impulses (changed in place), a sweep after each; returns as `_sweep`.
+
+    A step that was solved may be followed by a longer one; one that was not is tried again with a shorter one, from
+    where it came to if that is nearer.
+    """
+    epsilon, v, residual = START, problem.v_pre, np.inf
+    last = min(max_sweeps, sweeps + NEWTON)
+    while residual > tolerance and sweeps + ITERATIONS < last and visits < max_visits:
+        trial, trial_friction, solved, steps = proximal_step(
+            problem, elimination, target, impulse, friction_impulse, epsilon=epsilon, tolerance=tolerance
+        )
+        trial_v, more, more_visits, left = _swept(
+            problem, target, trial, trial_friction, None, tolerance, 1, max_visits
+        )
+        epsilon = max(0.1 * epsilon, SMALLEST) if solved else min(10.0 * epsilon, LARGEST)
+        if solved or left < residual:
+            impulse[:], friction_impulse[:], v, residual = trial, trial_friction, trial_v, left
+        sweeps += more + steps
+        visits += more_visits + steps * elimination.products
+    return v, sweeps, visits, residual
+
+
+def _swept(
+    problem: ImpactProblem, target: Floats, impulse: Floats, friction_impulse: Floats, rows: SphereRows | None,
+    tolerance: float, max_sweeps: int, max_visits: int,
+) -> tuple[Floats, int, int, float]:  # fmt: skip
+    """Sweeps from given impulses (changed in place); returns as `_sweep`, in the problem's order."""
     order, tangent_order = _orders(problem, rows)
     found, found_friction = impulse[order], friction_impulse[tangent_order]
     v, sweeps, visits, residual = _sweep(
@@ -66,14 +151,9 @@ def sweep(
         problem.v_pre.copy() if rows is None else rows.V.ravel(), target[order], found, found_friction,
         tolerance, max_sweeps, max_visits,
     )  # fmt: skip
-    return (
-        _scattered(found, order),
-        _scattered(found_friction, tangent_order),
-        v if rows is None else rows.velocity_in_problem_order(v.reshape(-1, STRIDE), problem.n),
-        sweeps,
-        visits,
-        residual,
-    )
+    impulse[order], friction_impulse[tangent_order] = found, found_friction
+    velocity = v if rows is None else rows.velocity_in_problem_order(v.reshape(-1, STRIDE), problem.n)
+    return velocity, sweeps, visits, residual
 
 
 def dissipate(
@@ -106,13 +186,6 @@ def _orders(problem: ImpactProblem, rows: SphereRows | None) -> tuple[Ints, Ints
     tangent_order: Ints = np.repeat(2 * order, 2)
     tangent_order[1::2] += 1
     return order, tangent_order
-
-
-def _scattered(ordered: Floats, order: Ints) -> Floats:
-    """Put an array in the problem's order."""
-    array = np.empty_like(ordered)
-    array[order] = ordered
-    return array
 
 
 def _normals(

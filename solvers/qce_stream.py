@@ -5,8 +5,9 @@
 Only neighbors with s_j < s_i matter to contact i, hence the ends are unique and any order of evaluation that runs
 until nothing changes gives what `qce_heap` gives, which pops the earliest end first. The speed comes from
 
-- the order: contacts are sorted, coarsely, by the end that they would have if no neighbor ended before them. Most are
-  then evaluated after all that they depend on: 1.16 (3,000 contacts) to 1.30 (183,000) evaluations an end;
+- the order: contacts are sorted, coarsely, by the end that they would have if no neighbor ended before them, and what
+  an evaluation puts in doubt is evaluated again before long. Most ends are then found after all that they depend on:
+  1.05 to 1.16 evaluations an end (sphere packs of 3,000 to 183,000 contacts);
 - one root: with the neighbors that end before it known, the end is the root of one quadratic about s = 0,
 
       ½ A s² + (B - F) s - ½ C = 0,   A = Σ_late c_j,  B = Σ_early c_j s_j,  C = Σ_early c_j s_j²,   c_j = W_ij F_j
@@ -18,8 +19,8 @@ until nothing changes gives what `qce_heap` gives, which pops the earliest end f
 
       A s² + Σ_{c_j > 0} c_j s_j² + Σ_{c_j < 0} c_j (2 s s_j - s_j²) > 0        (sums over early neighbors)
 
-  82 to 90 % of the evaluations pass (sphere packs). Where only a neighbor is on the wrong side of the root, 3 to 4 %
-  of the evaluations, the root with the others is tried; the rest go through time piece by piece, as the heap does;
+  About nine evaluations in ten pass (sphere packs). Where only a neighbor is on the wrong side of the root, the root
+  with the others is tried; the rest, 7 to 9 in a hundred, go through time piece by piece, as the heap does;
 - no heap, no W: only the couplings of contacts that are active together, for one outer iteration.
 
 No slope is updated by subtraction: the couplings of all neighbors still active are summed anew in each evaluation
@@ -42,7 +43,7 @@ from solvers._jit import alone, kernel, parallel_kernel, prange
 from solvers.problem import ImpactProblem
 from solvers.qce_heap import MAX_VISITS
 from solvers.solution import Floats
-from solvers.sphere_rows import SphereRows
+from solvers.sphere_rows import STRIPS, SphereRows
 
 Ints = npt.NDArray[np.int32]
 Counts = npt.NDArray[np.int64]
@@ -59,15 +60,18 @@ NEVER = float(np.finfo(np.float64).max)
 # Sorting keys are the leading bits of a float: its exponent and four bits of its mantissa, 16 keys an octave.
 KEY_BITS = 48
 KEYS = 512
-# The contacts are sorted and evaluated in tiles of so many, which fit in the second-level cache with their couplings.
-# Smaller ones cost more evaluations, as neighbors in a later tile are not known: 1.37 an end with 4,096, 1.26 with
-# 8,192, 1.21 with 16,384 (kick, 183,000 contacts in one strip).
-TILE = 8192
+# The contacts are sorted and evaluated in tiles of so many at most. Smaller ones, which would stay in the second-level
+# cache, cost more evaluations, as neighbors in a later tile are not known: 1.19 an end with 8,192, 1.10 with these
+# (kick, 183,000 contacts).
+TILE = 32_768
+# So many are evaluated, then those that they woke: what comes later in the order meets ends that are right. Without
+# that, 1.16 evaluations an end instead of 1.05 (kick, 12,000 contacts).
+CHUNK = 256
 # So many contacts are searched, then those of them that approach are packed: they are still in the cache.
 BLOCK = 2048
-# Sweeps of a tile before the next is begun. Without the ends in later tiles two contacts can push each other's end on
-# for ever; with all of them, only a contact that never ends does.
-TILE_SWEEPS = 4
+# Sweeps over what a chunk woke before the next is begun. Without the ends to come two contacts can push each other's
+# end on for ever; with all of them, only a contact that never ends does.
+CHUNK_SWEEPS = 3
 # Where fewer than one contact in so many was active, only their neighborhood is searched for approaching contacts.
 SEARCH_ALL = 24
 # Rounding can make tied contacts wake each other for ever; no problem met here needed 100 sweeps beyond its contacts.
@@ -75,8 +79,6 @@ SPARE_SWEEPS = 100
 
 # From this many contacts on sharing the work out pays: below it threads wait for one another most of the time.
 SHARED_CONTACTS = 30_000
-# Strips of contacts that threads share out, the even ones and then the odd ones; the same for any number of threads.
-MOST_STRIPS = 8
 ONE = np.uint32(1)
 
 STALLED = 1
@@ -110,7 +112,7 @@ def _strips(rows: SphereRows) -> Ints:
         return np.array([0, m], dtype=np.int32)
     strips = rows.strip.size - 1
     # Strips that stand together make a strip: those of even number still share no movable body.
-    return np.append(rows.strip[: -1 : -(-strips // MOST_STRIPS)], np.int32(m))
+    return np.append(rows.strip[: -1 : -(-strips // STRIPS)], np.int32(m))
 
 
 def largest_approach(rows: SphereRows) -> float:
@@ -170,16 +172,15 @@ def _end_by_pieces(
 
 @kernel
 def _sweep(
-    begin: int, stop: int, listed: int, order: Indices, F: Floats, own: Floats, start: Indices, neighbor: Indices,
-    coupling: Floats, end: Floats, awake: Flags, woken: Indices,
+    begin: int, stop: int, due: Indices, load: Floats, start: Indices, neighbor: Indices, coupling: Floats,
+    end: Floats, awake: Flags, woken: Indices, count: int,
 ) -> int:  # fmt: skip
-    """Evaluate the listed contacts, all of them in one strip (from `begin` to `stop`).
+    """Evaluate contacts that are due, all of them in one strip (from `begin` to `stop`).
 
-    Those that were evaluated before and must be again become awake; returns how many of the strip, and lists them.
+    Those that were evaluated before and must be again become awake. Those of the strip are listed in `woken`, which
+    holds `count` already; returns how many it holds then.
     """
-    count = 0
-    for p in range(listed):
-        k = order[p]
+    for k in due:
         before = end[k]
         row, row_stop = start[k, 0], start[k, 1]
         # Early neighbors are those evaluated already that end before this contact: as far as is known, or guessed.
@@ -188,7 +189,7 @@ def _sweep(
         # Whether a neighbor that ends later may not have known this end.
         wakes = False
         for attempt in range(2):
-            A = own[k]
+            A = load[k, 1]
             B = C = B_pull = C_pull = 0.0
             latest = 0.0
             following = PENDING
@@ -209,7 +210,7 @@ def _sweep(
                 late = PENDING if early else s_j
                 following = late if late < following else following
             # The root of the quadratic, without cancellation; 0 where it has none, which is refused.
-            v = B - F[k]
+            v = B - load[k, 0]
             discriminant = v * v + A * C
             sum_of_roots = abs(v) + np.sqrt(max(discriminant, 0.0))
             denominator = sum_of_roots if v > 0.0 else A
@@ -223,7 +224,7 @@ def _sweep(
                     # Some are on the wrong side of this root: with those that end before it, it is right nearly always.
                     limit = s
                     continue
-            s = _end_by_pieces(F[k], own[k], row, row_stop, neighbor, coupling, end)
+            s = _end_by_pieces(load[k, 0], load[k, 1], row, row_stop, neighbor, coupling, end)
             wakes = True
             break
         awake[k] = 0
@@ -245,8 +246,8 @@ def _sweep(
 
 
 @kernel
-def _sort(begin: int, stop: int, guess: Floats, key: Ints, first: Ints, order: Indices, listed: int) -> None:
-    """Counting sort of some active contacts by their likely end, behind those listed; equal keys keep their order."""
+def _sort(begin: int, stop: int, guess: Floats, key: Ints, first: Ints, order: Indices) -> None:
+    """Counting sort of some active contacts by their likely end; equal keys keep their order."""
     bits = guess.view(np.int64)
     total = 0
     finite = 0
@@ -257,7 +258,6 @@ def _sort(begin: int, stop: int, guess: Floats, key: Ints, first: Ints, order: I
             finite += 1
     lowest = total // max(finite, 1) - KEYS // 2
     first[:] = 0
-    first[0] = listed
     for k in range(begin, stop):
         key[k] = min(max(key[k] - lowest, 0), KEYS - 1)
         first[key[k] + 1] += 1
@@ -271,35 +271,40 @@ def _sort(begin: int, stop: int, guess: Floats, key: Ints, first: Ints, order: I
 
 @kernel
 def _settle(
-    begin: int, stop: int, tile: int, tile_stop: int, listed: int, F: Floats, own: Floats, guess: Floats,
-    start: Indices, neighbor: Indices, coupling: Floats, end: Floats, awake: Flags, order: Indices, woken: Indices,
-    key: Ints, first_key: Ints,
+    begin: int, stop: int, tile: int, tile_stop: int, load: Floats, guess: Floats, start: Indices,
+    neighbor: Indices, coupling: Floats, end: Floats, awake: Flags, order: Indices, woken: Indices, again: Indices,
+    count: int, key: Ints, first_key: Ints,
 ) -> tuple[int, int]:  # fmt: skip
-    """Evaluate a tile of a strip, and what the tiles before it left over, the first entries of `order`.
+    """Evaluate a tile of a strip, and what the tiles before it left over, the first `count` entries of `woken`.
 
     `guess` is the end that a contact would have if none of its neighbors ended before it.
 
     Returns:
-        evaluations, and how many contacts are left over in `order`.
+        evaluations, and how many contacts are left over in `woken`.
     """
-    _sort(tile, tile_stop, guess, key, first_key, order, listed)
-    listed += tile_stop - tile
-    evaluations = 0
-    due = order
-    for _ in range(TILE_SWEEPS):
-        evaluations += listed
-        listed = _sweep(begin, stop, listed, due, F, own, start, neighbor, coupling, end, awake, woken)
-        due, woken = woken, due
-        if listed == 0:
-            break
-    for p in range(listed):
-        order[p] = due[p]
-    return evaluations, listed
+    _sort(tile, tile_stop, guess, key, first_key, order)
+    size = tile_stop - tile
+    evaluations = size
+    due = woken
+    for chunk in range(0, size, CHUNK):
+        count = _sweep(
+            begin, stop, order[chunk : min(chunk + CHUNK, size)], load, start, neighbor, coupling, end, awake,
+            due, count,
+        )  # fmt: skip
+        for _ in range(CHUNK_SWEEPS):
+            if count == 0:
+                break
+            evaluations += count
+            count = _sweep(begin, stop, due[:count], load, start, neighbor, coupling, end, awake, again, 0)
+            due, again = again, due
+    for p in range(count):
+        woken[p] = due[p]
+    return evaluations, count
 
 
 @kernel
 def _finish(
-    strip: Ints, size: Counts, F: Floats, own: Floats, start: Indices, neighbor: Indices, coupling: Floats,
+    strip: Ints, size: Counts, load: Floats, start: Indices, neighbor: Indices, coupling: Floats,
     end: Floats, awake: Flags, order: Indices, woken: Indices,
 ) -> tuple[int, bool]:  # fmt: skip
     """Evaluate what is awake in any strip until nothing changes; returns evaluations, and whether that came about."""
@@ -316,7 +321,7 @@ def _finish(
         if listed == 0:
             return evaluations, True
         evaluations += listed
-        listed = _sweep(0, F.size, listed, order, F, own, start, neighbor, coupling, end, awake, woken)
+        listed = _sweep(0, load.shape[0], order[:listed], load, start, neighbor, coupling, end, awake, woken, 0)
         order, woken = woken, order
     return evaluations, False
 
@@ -505,7 +510,7 @@ def _places(met: Counts, place: Offsets) -> None:
 @kernel
 def _couple(
     begin: int, stop: int, row: np.uint64, near: Floats, pair: Indices, V: Floats, span: Indices, member: Indices,
-    start: Indices, neighbor: Indices, coupling: Floats, own: Floats, guess: Floats,
+    start: Indices, neighbor: Indices, coupling: Floats, load: Floats, guess: Floats,
 ) -> np.uint64:  # fmt: skip
     """Couplings W_ij F_j of some active contacts, written from `row` on; returns where they end."""
     for k in range(np.uint64(begin), np.uint64(stop)):
@@ -526,7 +531,8 @@ def _couple(
                 slope += c
                 row += np.uint64(j != k)
         start[k, 1] = row
-        own[k] = (x * x + y * y + z * z) * (V[pair[k, 0], 3] + V[pair[k, 1], 3]) * F
+        load[k, 0] = F
+        load[k, 1] = (x * x + y * y + z * z) * (V[pair[k, 0], 3] + V[pair[k, 1], 3]) * F
         guess[k] = F / slope if slope > 0.0 else NEVER
     return row
 
@@ -552,21 +558,21 @@ def _apply(
 @kernel
 def _settle_strip(
     begin: int, stop: int, row: np.uint64, near: Floats, pair: Indices, V: Floats, span: Indices, member: Indices,
-    F: Floats, own: Floats, guess: Floats, start: Indices, neighbor: Indices, coupling: Floats, end: Floats,
-    awake: Flags, order: Indices, woken: Indices, key: Ints, first_key: Ints,
+    load: Floats, guess: Floats, start: Indices, neighbor: Indices, coupling: Floats, end: Floats,
+    awake: Flags, order: Indices, woken: Indices, again: Indices, key: Ints, first_key: Ints,
 ) -> int:  # fmt: skip
     """Couple and evaluate the active contacts of a strip, tile by tile; returns the number of evaluations."""
     total = 0
-    listed = 0
+    left = 0
     for tile in range(begin, stop, TILE):
         tile_stop = min(tile + TILE, stop)
         row = _couple(
-            tile, tile_stop, row, near, pair, V, span, member, start, neighbor, coupling, own, guess
+            tile, tile_stop, row, near, pair, V, span, member, start, neighbor, coupling, load, guess
         )  # fmt: skip
         # Its couplings are still in the cache.
-        evaluations, listed = _settle(
-            begin, stop, tile, tile_stop, listed, F, own, guess, start, neighbor, coupling, end, awake,
-            order, woken, key, first_key,
+        evaluations, left = _settle(
+            begin, stop, tile, tile_stop, load, guess, start, neighbor, coupling, end, awake, order, woken, again,
+            left, key, first_key,
         )  # fmt: skip
         total += evaluations
     return total
@@ -589,13 +595,15 @@ def _solve_spheres(
     F = np.empty(m)
     near = np.empty((m, 4))
     pair = np.empty((m, 2), np.uint32)
-    own = np.empty(m)
+    # F_i and W_ii F_i, side by side: an evaluation needs both.
+    load = np.empty((m, 2))
     guess = np.empty(m)
     end = np.empty(m)
     awake = np.empty(m, np.uint8)
     start = np.empty((m, 2), np.uint32)
     order = np.empty(m, np.uint32)
     woken = np.empty(m, np.uint32)
+    again = np.empty(m, np.uint32)
     key = np.empty(m, np.int32)
     neighbor = np.empty(0, np.uint32)
     coupling = np.empty(0)
@@ -660,11 +668,12 @@ def _solve_spheres(
                 c = int(2 * np.int64(half) + parity)
                 stop = strip[c] + size[c]
                 evaluated[c] = _settle_strip(
-                    strip[c], stop, place[c], near, pair, V, span, member, F, own, guess, start,
-                    neighbor, coupling, end, awake, order[strip[c] : stop], woken[strip[c] : stop], key, first_key[c],
+                    strip[c], stop, place[c], near, pair, V, span, member, load, guess, start, neighbor, coupling,
+                    end, awake, order[strip[c] : stop], woken[strip[c] : stop], again[strip[c] : stop], key,
+                    first_key[c],
                 )  # fmt: skip
         evaluations, settled = _finish(
-            strip, size, F, own, start, neighbor, coupling, end, awake, order, woken
+            strip, size, load, start, neighbor, coupling, end, awake, order, woken
         )  # fmt: skip
         visits += int(evaluated.sum()) + evaluations
         if not settled:
@@ -726,7 +735,7 @@ def _enlist_sparse(
 @kernel
 def _couple_sparse(
     size: int, found: Indices, F: Floats, JM_start: Ints, JM_index: Indices, JM: Floats, first: Ints, count: Ints,
-    record: Floats, record_of: Indices, met: Ints, own: Floats, guess: Floats, end: Floats, awake: Flags,
+    record: Floats, record_of: Indices, met: Ints, load: Floats, guess: Floats, end: Floats, awake: Flags,
     start: Indices, neighbor: Indices, coupling: Floats,
 ) -> tuple[Indices, Floats]:  # fmt: skip
     """Couplings W_ij F_j of all active contacts; returns their arrays, made larger where they were too small."""
@@ -760,7 +769,8 @@ def _couple_sparse(
                     stop += 1
                 else:
                     coupling[met[j]] += c
-        own[k] = own_k
+        load[k, 0] = F[k]
+        load[k, 1] = own_k
         start[k, 1] = stop
         guess[k] = F[k] / w if w > 0.0 else NEVER
         end[k] = PENDING
@@ -800,7 +810,8 @@ def _solve_sparse(
     # Per active contact.
     found = np.empty(m, np.uint32)
     F = np.empty(m)
-    own = np.empty(m)
+    # F_i and W_ii F_i, side by side: an evaluation needs both.
+    load = np.empty((m, 2))
     guess = np.empty(m)
     end = np.empty(m)
     awake = np.empty(m, np.uint8)
@@ -808,6 +819,7 @@ def _solve_sparse(
     met = np.empty(m, np.int32)
     order = np.empty(m, np.uint32)
     woken = np.empty(m, np.uint32)
+    again = np.empty(m, np.uint32)
     first_key = np.empty(KEYS + 1, np.int32)
     neighbor = np.empty(8 * m + 8, np.uint32)
     coupling = np.empty(8 * m + 8)
@@ -829,19 +841,19 @@ def _solve_sparse(
         visits += size
         _enlist_sparse(size, found, F, J_start, J_index, J, first, count, record, record_of)
         neighbor, coupling = _couple_sparse(
-            size, found, F, JM_start, JM_index, JM, first, count, record, record_of, met, own, guess, end, awake,
+            size, found, F, JM_start, JM_index, JM, first, count, record, record_of, met, load, guess, end, awake,
             start, neighbor, coupling,
         )  # fmt: skip
-        listed = 0
+        left = 0
         for tile in range(0, size, TILE):
             # `met` has served: it takes the sorting keys.
-            evaluations, listed = _settle(
-                0, size, tile, min(tile + TILE, size), listed, F, own, guess, start,
-                neighbor, coupling, end, awake, order, woken, met, first_key,
+            evaluations, left = _settle(
+                0, size, tile, min(tile + TILE, size), load, guess, start, neighbor, coupling, end, awake,
+                order, woken, again, left, met, first_key,
             )  # fmt: skip
             visits += evaluations
         evaluations, settled = _finish(
-            strip, sizes, F, own, start, neighbor, coupling, end, awake, order, woken
+            strip, sizes, load, start, neighbor, coupling, end, awake, order, woken
         )  # fmt: skip
         visits += evaluations
         if not settled:

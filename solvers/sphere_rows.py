@@ -33,8 +33,9 @@ Indices = npt.NDArray[np.uint32]
 
 # Below this many contacts everything fits in the cache and a renumbering does not pay.
 RENUMBERED = 8_000
-# Strips of contacts that threads share out; the same for any number of threads.
-STRIPS = 8
+# Strips of contacts that threads share out, those of even number, then those of odd number; as many for any number of
+# threads. They keep two threads busy. More would serve more, but what lies along a border costs extra work.
+STRIPS = 4
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,7 @@ class SphereRows:
     owner: Ints = field(default_factory=lambda: np.empty(0, np.int32))
     """The problem's number of each body, shape (bodies + 1,); empty for rows that come without an `ImpactProblem`."""
 
-    strip: Ints = field(default_factory=lambda: np.zeros(1, np.int32))
+    strip: Ints = field(default_factory=lambda: np.empty(0, np.int32))
     """Where strips of contacts begin, shape (strips + 1,), their last entry the end: those of even number share no
     movable body, nor do those of odd number. Empty where none are known."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
 import numpy as np
@@ -22,10 +23,13 @@ from scenarios.bunnies import (
 from scenarios.world.rigid_world import RigidWorld
 from scenarios.world.rotation import rotation_matrix
 from scenarios.world.shapes import Shape, box
-from solvers import ImpactProblem, ProblemError
+from solvers import ImpactProblem, ProblemError, Status
 from solvers.qce_lcp import QceLcp
 
-LAW = QceLcp(tolerance=1e-6, max_sweeps=500)
+LAW = QceLcp(tolerance=1e-6, max_sweeps=1000)
+# Share of the steps that may end at their bound: the pile is one impact of some 400 contacts, and one of them that goes
+# round in circles is enough. Measured 255 of 3,684.
+UNSOLVED = 0.1
 # How far a bunny's surface may lie outside of its convex parts, over its height: fillets are bridged by none.
 FIT = 0.08
 
@@ -107,13 +111,14 @@ def test_any_closed_mesh_can_fall_instead(tmp_path: Path) -> None:
 
 def test_a_mesh_that_is_not_there_or_not_closed_is_refused(tmp_path: Path) -> None:
     trimesh = pytest.importorskip("trimesh")
-    with pytest.raises(ProblemError, match=r"nowhere\.stl is missing"):
-        bunnies_and_pawns(bunnies=1, pawns=0, mesh=str(tmp_path / "nowhere.stl")).world(solver=LAW)
+    # When the scene is described, before a run begins; body and field are named.
+    with pytest.raises(ProblemError, match=r"bunny 0: mesh: .*nowhere\.stl is missing"):
+        bunnies_and_pawns(bunnies=1, pawns=0, mesh=str(tmp_path / "nowhere.stl"))
     shape = box((0.2, 0.3, 0.1))
     path = tmp_path / "open.stl"
     trimesh.Trimesh(shape.vertices, shape.faces[:-1]).export(path)
     with pytest.raises(ProblemError, match="must be closed"):
-        bunnies_and_pawns(bunnies=1, pawns=0, mesh=str(path)).world(solver=LAW)
+        bunnies_and_pawns(bunnies=1, pawns=0, mesh=str(path))
 
 
 def test_the_energy_error_is_that_of_the_elastic_step() -> None:
@@ -137,13 +142,17 @@ def test_144_bunnies_and_16_pawns_come_to_rest() -> None:
     assert isinstance(world, RigidWorld)
     peak = overlap = 0.0
     errors: list[float] = []
+    unsolved = 0
+    begin = time.process_time()
     while STAGES[1] not in world.fired and world.steps < scene.default_steps:
-        errors.append(elastic_energy_error(world.problem()))
-        world.step()
+        unsolved += world.step().status is not Status.CONVERGED
+        errors.append(scene.measure(world)["energy error of the QCE step"])
         peak, overlap = max(peak, world.kinetic_energy()), max(overlap, world.overlap)
     error = float(np.nanmean(errors))
-    print(f"\nat rest at {world.fired.get(STAGES[1])} s, deepest overlap {overlap:.2e} m, peak {peak:.0f} J")
+    print(f"\n{unsolved} of {world.steps} steps not converged; {time.process_time() - begin:.0f} s of processor time")
+    print(f"at rest at {world.fired.get(STAGES[1])} s, deepest overlap {overlap:.2e} m, peak {peak:.0f} J")
     print(f"QCE step: mean |K⁺ - K⁻| / K⁻ = {error:.2e}; Zhang 2015: 2.43e-4")
     assert scene.measure(world)["bodies lost"] == 0.0
+    assert unsolved <= UNSOLVED * world.steps
     assert world.kinetic_energy() < AT_REST * peak
     assert error < 2.43e-4

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
 import numpy as np
@@ -18,17 +19,20 @@ from scenarios.card_house import (
     house,
 )
 from scenarios.world.rigid_world import RigidWorld
-from solvers import ProblemError, Solver
+from solvers import ProblemError, Solver, Status
 from solvers.newton_lcp import NewtonLcp
 from solvers.qce_lcp import QceLcp
 
 # A resting step is converged within a few sweeps from the last one's impulses; a fall may end at the bound.
 LAWS: dict[str, Solver] = {
-    "qce-lcp": QceLcp(tolerance=1e-6, max_sweeps=500),
-    "lcp-pgs": NewtonLcp(tolerance=1e-6, max_iterations=500),
+    "qce-lcp": QceLcp(tolerance=1e-6, max_sweeps=1000),
+    "lcp-pgs": NewtonLcp(tolerance=1e-6, max_iterations=1000),
 }
 # What counts as standing, over the length of a card.
 STANDS = 0.01
+# Share of the steps of the fall that may end at their bound: friction has impacts whose solutions iterations turn away
+# from.
+UNSOLVED = 0.01
 SMALL = {"pairs": 2, "storeys": 1}
 
 
@@ -136,16 +140,25 @@ def test_24_cards_stand_for_ten_seconds_then_fall_and_come_to_rest(law: str) -> 
     assert isinstance(world, RigidWorld)
     cards = house(4, 3, friction=0.8)
     moved = peak = 0.0
+    unsolved = 0
+    begin = time.process_time()
     while STAGES[1] not in world.fired and world.steps < scene.default_steps:
-        world.step()
+        unsolved += world.step().status is not Status.CONVERGED
         if STAGES[0] not in world.fired:
             moved = max(moved, displacement(cards, world))
         peak = max(peak, cards_energy(cards, world))
     print(
         f"\n{law}: moved {moved:.2e} card lengths in 10 s; peak {peak:.0f} J; at rest at {world.fired.get(STAGES[1])} s"
     )
+    measures = scene.measure(world)
+    print(
+        f"{unsolved} of {world.steps} steps not converged, {time.process_time() - begin:.0f} s of processor time; "
+        f"{measures['cards in their place']:.0f} cards in their place, "
+        f"the highest at {measures['height of the highest card [m]']:.2f} m"
+    )
     assert moved < STANDS
-    assert displacement(cards, world) > 0.5
+    assert measures["cards in their place"] <= 2
+    assert unsolved <= UNSOLVED * (world.steps - 10_000)
     assert cards_energy(cards, world) < AT_REST * peak
 
 

@@ -277,6 +277,12 @@ def test_friction_stays_in_its_cone_and_takes_energy(restitution: float) -> None
     assert energy_change(problem, solution.v_post) < 0.0
 
 
+def test_friction_asks_for_no_finer_step() -> None:
+    # All friction after the kicks: an energy error of first order, thirteen times the steps on this layer.
+    smooth, rough = (sphere_pack(spheres=128, start="hot", friction=friction).problem for friction in (0.0, 0.5))
+    assert ExplicitHertz().solve(rough).iterations < 2 * ExplicitHertz().solve(smooth).iterations
+
+
 def test_friction_stops_the_slip_of_a_slow_ball_and_slows_a_fast_one() -> None:
     # A solid ball on a floor: an impulse μ λ slows it by μ (1 + e) v_n, and it rolls at 5/7 of a slow slip.
     inverse_mass = np.array([1.0, 1.0, 2.5])  # x, z, radius times spin (inertia 2/5)
@@ -322,6 +328,25 @@ def test_packed_spheres_agree_with_the_general_path(start: str) -> None:
     assert abs(energy_change(problem, packed.v_post)) <= EXACT
     # The two differ in their grids of local steps, and in where the gaps are forgotten: part of the error itself.
     assert np.sqrt(np.mean((packed.v_post - general.v_post[:-1]) ** 2)) < PATHS_APART
+
+
+def test_the_step_of_packed_spheres_grows_as_speeds_fall() -> None:
+    problem = sphere_pack(spheres=300, start="hot").problem
+    packed, general = ExplicitHertz().solve(problem), ExplicitHertz().solve(with_an_idle_velocity(problem))
+    assert packed.iterations < 0.8 * general.iterations
+
+
+def test_a_step_that_is_too_long_ends_its_round_unfinished() -> None:
+    problem = sphere_pack(spheres=300, start="hot").problem
+    contacts = explicit_hertz_spheres.spheres(problem, problem.stiffness, exponent=1.5, V=1.0, w=2.0)
+    assert contacts is not None
+    v = contacts.v_pre
+    *_, steps, _, finished = contacts.integrate(
+        v, contacts.relative_velocity(v), exponent=1.5, h=10.0, gap_memory=0.01, threshold=1e-9, slowest=1e-3,
+        max_steps=10_000, max_visits=10**9,
+    )  # fmt: skip
+    assert not finished
+    assert steps < 100
 
 
 def test_the_number_of_threads_changes_no_bit() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numba
 import numpy as np
@@ -238,6 +239,7 @@ def test_tiles_change_nothing_but_the_order_of_evaluation(TILE: int, monkeypatch
     for name in KERNELS:
         monkeypatch.setattr(qce_stream, name, getattr(qce_stream, name).py_func)
     monkeypatch.setattr(qce_stream, "TILE", TILE)
+    monkeypatch.setattr(qce_stream, "CHUNK", 7)
     for form in (by_sphere_rows, by_sparse_rows):
         impulse, iterations, _, flag = form(problem, threshold=TOLERANCE * problem.speed, defer=0.0, max_iterations=3)
         np.testing.assert_allclose(impulse, expected[0], rtol=0, atol=SAME_ANSWER * expected[0].max())
@@ -303,6 +305,17 @@ def test_strips_of_one_parity_share_no_movable_body() -> None:
             bodies = bodies[rows.V[bodies, 3] > 0]
             assert (owner[bodies] == -1).all()
             owner[bodies] = c
+
+
+def test_many_strips_are_joined_with_their_neighbors(monkeypatch: pytest.MonkeyPatch) -> None:
+    rows = sphere_rows(sphere_pack(spheres=100).problem)
+    assert rows is not None
+    m = len(rows.normal)
+    thin = replace(rows, strip=(np.arange(17) * m // 16).astype(np.int32))
+    np.testing.assert_array_equal(qce_stream._strips(thin), [0, m])
+    monkeypatch.setattr(qce_stream, "SHARED_CONTACTS", 0)
+    np.testing.assert_array_equal(qce_stream._strips(thin), thin.strip[:: 16 // STRIPS])
+    np.testing.assert_array_equal(qce_stream._strips(rows), [0, m])
 
 
 def test_contacts_that_cannot_be_cut_are_one_strip() -> None:

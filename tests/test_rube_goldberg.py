@@ -26,13 +26,13 @@ from scenarios.rube_goldberg import (
 )
 from scenarios.world.moving_scene import STAGES_FIRED
 from scenarios.world.rigid_world import RigidWorld
-from solvers import SOLVERS, Solver
+from solvers import SOLVERS, Solver, Status
 from solvers.newton_lcp import NewtonLcp
 from solvers.qce_lcp import QceLcp
 
 LAWS: dict[str, Solver] = {
-    "qce-lcp": QceLcp(tolerance=1e-6, max_sweeps=500),
-    "lcp-pgs": NewtonLcp(tolerance=1e-6, max_iterations=500),
+    "qce-lcp": QceLcp(tolerance=1e-6, max_sweeps=1000),
+    "lcp-pgs": NewtonLcp(tolerance=1e-6, max_iterations=1000),
 }
 SPEED = 2.5
 
@@ -158,12 +158,16 @@ def test_every_body_is_drawn_and_each_kind_has_its_color() -> None:
 def test_with_the_wave_all_stages_fire_in_order() -> None:
     scene = rube_goldberg()
     world = machine("qce-lcp")
+    unsolved = 0
     while len(world.fired) < len(STAGES) and world.steps < scene.default_steps:
-        world.step()
+        unsolved += world.step().status is not Status.CONVERGED
+    print(f"\n{unsolved} of {world.steps} steps not converged", end="")
     for name, time in world.fired.items():
         print(f"\n{time:7.3f} s  {name}", end="")
     assert list(world.fired) == list(STAGES)
     assert sorted(world.fired.values()) == list(world.fired.values())
+    # Friction has impacts whose solutions iterations turn away from.
+    assert unsolved <= 0.01 * world.steps
 
 
 @pytest.mark.long

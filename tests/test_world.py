@@ -14,13 +14,14 @@ from scenarios.moving import MOVING
 from scenarios.world.checkpoint import FORMAT, CheckpointError, checkpoint, resume
 from scenarios.world.container import Container, Shake, Still, Vibration, box, drum
 from scenarios.world.grid import STRIPES, Contacts, find_contacts
-from scenarios.world.impact import ByProblem, Constant, Impact, Resolver, SlowingRestitution, Streamed
+from scenarios.world.impact import OVERSHOOT, ByProblem, Constant, Impact, Resolver, SlowingRestitution, Streamed
 from scenarios.world.moving_scene import STREAMED
 from scenarios.world.spheres import Spheres, spheres
 from scenarios.world.stepping import Settings, StepReport, World
 from scenarios.world.warm_start import NO_IMPULSES, LastImpulses
 from solvers import SOLVERS, ProblemError, Status, UnsupportedProblem
 from solvers.buffers import Buffers
+from solvers.newton_lcp import NewtonLcp
 from solvers.qce_lcp import QceLcp
 from solvers.solution import Floats
 from solvers.spinning_spheres import SpinningRows, sweep_spheres
@@ -133,6 +134,19 @@ def test_the_problem_of_a_step_is_that_step_and_can_be_replayed_alone() -> None:
     assert np.array_equal(v_post[:, 3:], world.spheres.spin)
 
 
+def test_the_problem_of_what_lies_is_replayed_from_what_it_started_from() -> None:
+    law = NewtonLcp(max_iterations=20)
+    world = World("pile", pile(), box(1.0, 1.0, Still()), LYING, ByProblem(law))
+    run(world, 30)
+    impact = world.impact()
+    assert (impact.starts()["start"] > 0.0).any()
+    warm, cold = law.solve(impact.problem(), **impact.starts()), law.solve(impact.problem())
+    world.step()
+    assert np.array_equal(warm.v_post.reshape(-1, 6)[:, :3], world.spheres.velocity)
+    assert np.array_equal(warm.v_post.reshape(-1, 6)[:, 3:], world.spheres.spin)
+    assert warm.residual < 1e-2 * cold.residual
+
+
 @pytest.mark.parametrize("name", ["lcp-pgs", "gr", "gauss-seidel", "qce-lcp"])
 def test_other_solvers_take_the_same_scene(name: str) -> None:
     world = shaken(ByProblem(SOLVERS[name]()), friction=0.0, restitution=1.0)
@@ -234,11 +248,16 @@ def test_last_impulses_are_found_again_under_any_order_and_numbering() -> None:
     assert NO_IMPULSES.at(np.array([[1, 5]], dtype=np.int32)).tolist() == [[0.0] * 3]
 
 
+LYING = Settings(0.01, 1.0, Constant(0.5, resting=0.1), 0.3)
+
+
+def pile() -> Spheres:
+    """Eight on one another, held by walls on all sides: from zero each sweep reaches one sphere further."""
+    return spheres([[0.5, 0.5, 0.5 + k] for k in range(8)], 0.5, 1.0)
+
+
 def test_what_lies_starts_from_the_last_step() -> None:
-    # A pile of eight on one another, held by walls on all sides: from zero each sweep reaches one sphere further.
-    pile = spheres([[0.5, 0.5, 0.5 + k] for k in range(8)], 0.5, 1.0)
-    lying = Settings(0.01, 1.0, Constant(0.5, resting=0.1), 0.3)
-    world = World("pile", pile, box(1.0, 1.0, Still()), lying, Streamed(10, 1e-9))
+    world = World("pile", pile(), box(1.0, 1.0, Still()), LYING, Streamed(5, 1e-9, least_visits=0))
     residuals = [report.residual for report in run(world, 60)]
     assert residuals[0] > 1e-2
     assert residuals[-1] < 1e-4 * residuals[0]
@@ -271,6 +290,30 @@ def test_sweeps_that_end_early_gain_no_energy_and_lose_no_momentum(seed: int, fr
     push, rub = result.impulse[:, 0], result.impulse[:, 1:]
     assert (push >= 0.0).all()
     assert (np.abs(rub) <= friction * push[:, None] + ROUNDING).all()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_sweeps_that_overshoot_come_nearer_to_the_same_answer(seed: int) -> None:
+    # Without friction the velocities are unique. A heap that falls on its floor.
+    heap = gas(400, seed)
+    heap.place[:, :3] *= (0.6, 0.6, 0.75)
+    heap.motion[:-1, 2] -= 3.0
+    contacts = find_contacts(heap.place, box(5.0, 5.0, Still()))
+    assert contacts.m > 400
+
+    def swept(max_sweeps: int, overshoot: float) -> Floats:
+        motion = heap.motion.copy()
+        sweep_spheres(
+            SpinningRows(contacts.normal, contacts.body, motion, contacts.stripe), np.zeros(contacts.m),
+            np.zeros((contacts.m, 3)), friction=0.0, inertia=2.5, tolerance=TIGHT, max_sweeps=max_sweeps,
+            overshoot=overshoot,
+        )  # fmt: skip
+        return motion
+
+    answer = swept(20_000, 1.0)
+    assert np.abs(swept(20_000, OVERSHOOT) - answer).max() <= SAME_ANSWER
+    error, plain = (np.linalg.norm(swept(20, factor) - answer) for factor in (OVERSHOOT, 1.0))
+    assert error < 0.7 * plain
 
 
 def test_an_answer_that_gains_nothing_is_left_alone() -> None:

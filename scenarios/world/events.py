@@ -111,18 +111,6 @@ class EventWorld:
         """True where no further impact will come."""
         return self.flight.time_to_impact() == np.inf
 
-    def advance(self, until: float) -> None:
-        """Fly on to a time before the next impact [s], for a picture.
-
-        Raises:
-            ProblemError: the time is in the past, or after the next impact.
-        """
-        duration = until - self.time
-        if not 0.0 <= duration <= self.flight.time_to_impact():
-            raise ProblemError(f"until must lie between now ({self.time:g} s) and the next impact, not at {until:g} s")
-        self.flight.advance(duration)
-        self.time = until
-
     def step(self) -> StepReport:
         """Fly to the next impact and solve it.
 

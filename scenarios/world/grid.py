@@ -177,9 +177,9 @@ def _at_walls(
     """Append the walls that some spheres touch, numbered after the spheres; returns where the pairs end."""
     for p in range(planes.shape[0] + drums.shape[0]):
         wall = np.uint64(place.shape[1] + p) << HALF
-        for k in range(begin, end):
+        for k in range(np.uint64(begin), np.uint64(end)):
             if _height(place, k, planes, drums, p) <= place[3, k] + touching:
-                pair[size] = wall | np.uint64(k)
+                pair[size] = wall | k
                 size += 1
         if size > room:
             break
@@ -248,41 +248,53 @@ def _touching(
     return count
 
 
+@kernel
+def _describe_stripe(
+    place: Floats, planes: Floats, drums: Floats, order: Ints, pair: Pairs, read: int, begin: int, end: int,
+    normal: Floats, body: Indices, gap: Floats,
+) -> None:  # fmt: skip
+    """Normals, bodies and gaps of the contacts from `begin` to `end`, whose pairs stand from `read` on."""
+    bodies = place.shape[1]
+    ahead = np.uint64(read - begin)
+    for i in range(np.uint64(begin), np.uint64(end)):
+        k = pair[ahead + i] & LOWER
+        j = pair[ahead + i] >> HALF
+        body[i, 1] = order[k]
+        if j < np.uint64(bodies):
+            dx = place[0, j] - place[0, k]
+            dy = place[1, j] - place[1, k]
+            dz = place[2, j] - place[2, k]
+            distance = np.sqrt(dx * dx + dy * dy + dz * dz)
+            normal[i, 0] = dx / distance
+            normal[i, 1] = dy / distance
+            normal[i, 2] = dz / distance
+            body[i, 0] = order[k]
+            body[i, 1] = order[j]
+            gap[i] = distance - (place[3, k] + place[3, j])
+            continue
+        p = np.int64(j) - bodies
+        body[i, 0] = bodies
+        height = _height(place, k, planes, drums, p)
+        gap[i] = height - place[3, k]
+        if p < planes.shape[0]:
+            for axis in range(3):
+                normal[i, axis] = planes[p, axis]
+        else:
+            d = p - planes.shape[0]
+            distance = drums[d, 2] - height
+            normal[i, 0] = (drums[d, 0] - place[0, k]) / distance
+            normal[i, 1] = (drums[d, 1] - place[1, k]) / distance
+            normal[i, 2] = 0.0
+
+
 @parallel_kernel
 def _describe(
     place: Floats, row_sphere: Ints, planes: Floats, drums: Floats, order: Ints, pair: Pairs, stripe_start: Ints,
     normal: Floats, body: Indices, gap: Floats,
 ) -> None:  # fmt: skip
     """Normals, bodies and gaps of the pairs found, without the room between the stripes."""
-    bodies = place.shape[1]
     for stripe in prange(STRIPES):
-        read = MOST_CONTACTS * row_sphere[stripe] + np.int64(stripe) * bodies - stripe_start[stripe]
-        for i in range(stripe_start[stripe], stripe_start[stripe + 1]):
-            k = pair[read + i] & LOWER
-            j = pair[read + i] >> HALF
-            body[i, 1] = order[k]
-            if j < bodies:
-                dx = place[0, j] - place[0, k]
-                dy = place[1, j] - place[1, k]
-                dz = place[2, j] - place[2, k]
-                distance = np.sqrt(dx * dx + dy * dy + dz * dz)
-                normal[i, 0] = dx / distance
-                normal[i, 1] = dy / distance
-                normal[i, 2] = dz / distance
-                body[i, 0] = order[k]
-                body[i, 1] = order[j]
-                gap[i] = distance - (place[3, k] + place[3, j])
-                continue
-            p = np.int64(j) - bodies
-            body[i, 0] = bodies
-            height = _height(place, k, planes, drums, p)
-            gap[i] = height - place[3, k]
-            if p < planes.shape[0]:
-                for axis in range(3):
-                    normal[i, axis] = planes[p, axis]
-            else:
-                d = p - planes.shape[0]
-                distance = drums[d, 2] - height
-                normal[i, 0] = (drums[d, 0] - place[0, k]) / distance
-                normal[i, 1] = (drums[d, 1] - place[1, k]) / distance
-                normal[i, 2] = 0.0
+        read = MOST_CONTACTS * row_sphere[stripe] + np.int64(stripe) * place.shape[1]
+        _describe_stripe(
+            place, planes, drums, order, pair, read, stripe_start[stripe], stripe_start[stripe + 1], normal, body, gap
+        )

@@ -17,7 +17,6 @@ import numpy.typing as npt
 import scipy.sparse as sp
 
 from scenarios.world.collision import RigidContacts
-from scenarios.world.holding import holding_impulses
 from scenarios.world.spheres import Ints
 from solvers import ImpactProblem
 from solvers._jit import kernel
@@ -62,6 +61,8 @@ class RigidImpact:
     """Time from the start of the step to the impact of each body [s], shape (b,)."""
     closing: Floats
     """The same time for each contact [s], shape (m,)."""
+    borne: Floats
+    """`velocity`, without gravity's share for what rests, shape (b, 6)."""
 
     def problem(self) -> ImpactProblem:
         """The impact for any solver.
@@ -106,10 +107,6 @@ class RigidImpact:
         """
         axes = np.concatenate([self.contacts.normal[:, None], self.rows.tangent], axis=1)
         guess = np.ascontiguousarray(np.einsum("mtx,mx->mt", axes, impulse))
-        if not self.restitution.any():
-            guess = holding_impulses(
-                self.contacts.body, self.rows.block, self.velocity, self.inverse_mass, self.friction, guess
-            )
         return guess[:, 0], guess[:, 1:].ravel()
 
     def in_space(self, impulse: Floats, friction_impulse: Floats | None) -> Floats:

@@ -22,8 +22,10 @@ put to sleep.
 
     K⁺ + U⁺ - K - U = impact + friction + correction + integration
 
-Every term is measured by itself. `integration` is zero for bodies that touch nothing but for the splitting of their
-rotation.
+`impact` and `friction` are the work of the impulses: on the mean of the velocities before and after, and for an island
+that rests on that of the velocities at the ends of the step, as its impulses are the sum of a force that bears it all
+the time. What rests then contributes to none of the terms. `integration` is the error of the scheme, measured by
+itself; it is zero for bodies that touch nothing but for the splitting of their rotation.
 """
 
 from __future__ import annotations
@@ -51,7 +53,7 @@ from scenarios.world.rigid_rows import (
     meeting,
 )
 from scenarios.world.rotation import inverse, multiply, rotation_matrix
-from scenarios.world.shapes import Faces
+from scenarios.world.shapes import Faces, Shape
 from scenarios.world.spheres import Ints, Spheres
 from scenarios.world.stepping import Ledger, StepReport
 from solvers import ImpactProblem, ImpactSolution, ProblemError, Solver
@@ -64,6 +66,8 @@ CORRECTION_SWEEPS = 10
 # Bodies touch where their gap is below this share of the slop: two that lie on one another fall alike, so that nothing
 # but their gap tells that the upper one will have to be held.
 TOUCHING = 0.1
+# How far a round surface may lie beyond the triangles that it is drawn with, as a factor.
+ROUNDNESS = 1.01
 # Bodies that fall for a step gain g Δt at their centers and up to half as much again at the end of a rod that tips;
 # twice that is far below the speed of any fall that can be seen.
 RESTING_STEPS = 4.0
@@ -143,6 +147,8 @@ class RigidWorld:
         """Steps made."""
         self.overlap = 0.0
         """Deepest overlap that the last step left, before the correction [m]."""
+        self.solved: ImpactProblem | None = None
+        """The impact that the last step solved; None before the first step, and after a restart."""
         self._bodies = assemble(bodies, obstacles)
         self._obstacles = tuple(obstacles)
         self._triggers = tuple(triggers)
@@ -156,8 +162,8 @@ class RigidWorld:
         self._thinnest = float(self._thickness.min())
         self._slop = self.settings.slop * self._thinnest
         self._touching = TOUCHING * self._slop
-        # A ball's spin moves no point of it anywhere else.
-        self._arm = np.array([0.0 if shape.is_ball else shape.radius for shape in movable])
+        self._arms = np.array([_arms(shape) for shape in movable])
+        self._reach = np.array([shape.radius for shape in movable])
         for trigger in self._triggers:
             for name in trigger.release:
                 self._check_held(name)
@@ -336,10 +342,13 @@ class RigidWorld:
         velocity = kick(bodies.velocity, freedom, gravity * np.where(flight > 0.0, flight, step))
         rows = contact_rows(contacts, *place, velocity)
         restitution = _geometric_mean(bodies.restitution, contacts)
-        if self.settings.rest > 0.0:
-            restitution[largest_of_island(island, -rows.u) < self.settings.rest] = 0.0
+        rests = (largest_of_island(island, -rows.u) < self.settings.rest) & (self.settings.rest > 0.0)
+        restitution[rests] = 0.0
         friction = _geometric_mean(bodies.friction, contacts)
-        return RigidImpact(contacts, rows, velocity, freedom, friction, restitution, flight, closing)
+        return RigidImpact(
+            contacts, rows, velocity, freedom, friction, restitution, flight, closing,
+            self._without_gravity(velocity, contacts.body[rests]),
+        )  # fmt: skip
 
     def problem(self) -> ImpactProblem:
         """The impact that the next step will solve, as any solver takes it."""
@@ -352,33 +361,45 @@ class RigidWorld:
             ProblemError: a body moves too far in the step, or is lost; the text names it.
             UnsupportedProblem: the solver refuses the impact.
         """
-        impact = self.impact()
+        impact, bodies = self.impact(), self._bodies
         problem = impact.problem()
         last = self._last.match(impact.contacts, NEAR * self._thinnest)
         solution = self._solve(problem, impact, last)
         velocity = solution.v_post.reshape(-1, FREEDOMS)
         fastest = self._check_move(velocity)
         before = self._energies()
-        kicked, struck = self._kinetic(impact.velocity), self._kinetic(velocity)
+        borne, struck = self._kinetic(impact.borne), self._kinetic(velocity)
+        # What rests is held against gravity all the time: both work on the mean of the velocities at the step's ends.
+        pulled = 0.5 * float((bodies.mass * (impact.velocity - impact.borne) * (impact.borne + velocity)).sum())
         self._move(impact, velocity)
         drifted = self._energies()
         self._correct(problem, impact, solution)
         self._keep(impact, solution, last)
         self.steps += 1
+        self.solved = problem
         self._fire()
         kinetic, potential = self._energies()
-        normal = _normal_work(problem, solution, struck - kicked)
+        work = struck - borne - pulled
+        normal = _normal_work(problem, solution, impact.borne, work)
         # Gravity's share of the kinetic energy and of the potential one are the same but for the scheme's error.
-        integration = kicked - before[0] + drifted[0] - struck + drifted[1] - before[1]
+        integration = borne + pulled - before[0] + drifted[0] - struck + drifted[1] - before[1]
         return StepReport(
             step=self.steps, time=self.time, contacts=problem.m, status=solution.status,
             iterations=solution.iterations, sweeps=0, residual=solution.residual,
             overlap=self.overlap / self._thinnest, fastest=fastest,
             energy=Ledger(
-                kinetic=kinetic, potential=potential, impact=normal, friction=struck - kicked - normal,
+                kinetic=kinetic, potential=potential, impact=normal, friction=work - normal,
                 correction=potential - drifted[1], shaking=0.0, integration=integration,
             ),
         )  # fmt: skip
+
+    def _without_gravity(self, velocity: Floats, resting: Ints) -> Floats:
+        """Velocities before the impact (v, ω), shape (b, 6), of what rests those before gravity's share."""
+        borne = velocity.copy()
+        held = np.unique(resting)
+        held = held[held < self._bodies.movable]
+        borne[held] = self._bodies.velocity[held]
+        return borne
 
     def _contacts(self, velocity: Floats, freedom: Floats) -> RigidContacts:
         """Contacts of the next step, velocities after gravity given."""
@@ -458,7 +479,9 @@ class RigidWorld:
 
     def _speeds(self, velocity: Floats) -> Floats:
         """Speed of the fastest point of each body [m/s], shape (b,), or a bound on it."""
-        speed: Floats = np.linalg.norm(velocity[:, :3], axis=1) + self._arm * np.linalg.norm(velocity[:, 3:], axis=1)
+        spin = velocity[:, 3:]
+        turning = np.minimum(self._reach * np.linalg.norm(spin, axis=1), (self._arms * np.abs(spin)).sum(axis=1))
+        speed: Floats = np.linalg.norm(velocity[:, :3], axis=1) + turning
         return speed
 
     def _check_move(self, velocity: Floats) -> float:
@@ -496,6 +519,17 @@ class RigidWorld:
             )
 
 
+def _arms(shape: Shape) -> Floats:
+    """Distance of the farthest point from each principal axis [m], shape (3,), or a bound on it."""
+    if shape.is_ball:
+        # Its spin moves no point of it anywhere else.
+        return np.zeros(3)
+    square = shape.vertices**2
+    across: Floats = np.sqrt((square.sum(axis=1, keepdims=True) - square).max(axis=0))
+    # Pictures of round parts have their corners on the surface or a little inside.
+    return np.minimum(across * ROUNDNESS, shape.radius)
+
+
 def _turned_back(change: Floats, before: Floats, after: Floats, mass: Floats, inverse_mass: Floats) -> Floats:
     """A change of (v, ω) in a frame that has turned since: the same momentum and angular momentum in space."""
     momentum = np.einsum("bij,bj->bi", before, mass[:, 3:] * change[:, 3:])
@@ -527,8 +561,8 @@ def _geometric_mean(coefficient: Floats, contacts: RigidContacts) -> Floats:
     return mean
 
 
-def _normal_work(problem: ImpactProblem, solution: ImpactSolution, change: float) -> float:
-    """Work of the normal impulses [J]; all of the change where there is no friction, or the solver does not tell."""
+def _normal_work(problem: ImpactProblem, solution: ImpactSolution, borne: Floats, work: float) -> float:
+    """Work of the normal impulses [J]; all of the work where there is no friction, or the solver does not tell."""
     if solution.impulse is None or not problem.has_friction:
-        return change
-    return float(0.5 * solution.impulse @ (problem.u_pre + problem.J @ solution.v_post))
+        return work
+    return float(0.5 * solution.impulse @ (problem.J @ (borne.ravel() + solution.v_post)))

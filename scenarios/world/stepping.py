@@ -29,7 +29,7 @@ from scenarios.world.checkpoint import Arrays, CheckpointError
 from scenarios.world.container import Container
 from scenarios.world.grid import Indices, find_contacts
 from scenarios.world.impact import Impact, Resolver, Restitution
-from scenarios.world.spheres import INVERSE_INERTIA, Spheres
+from scenarios.world.spheres import INVERSE_INERTIA, Ints, Spheres
 from scenarios.world.warm_start import NO_IMPULSES, LastImpulses
 from solvers import ImpactProblem, ProblemError, Status
 from solvers._jit import kernel, parallel_kernel, prange
@@ -202,9 +202,11 @@ class World:
         outcome = self.resolver.resolve(impact)
         before, after = self._sums, _sums(motion)
         self._check_move(float(np.sqrt(after[FASTEST])))
-        shift, overlap = _push_apart(
-            contacts.normal, contacts.body, contacts.gap, u_pre, motion,
+        shift = self._buffers.array("shift", (len(motion), 3))
+        overlap = _push_apart(
+            contacts.normal, contacts.body, contacts.gap, contacts.stripe, u_pre, motion,
             self.settings.step, self.settings.slop * self._smallest, self.settings.correction,
+            self._buffers.array("deep", (contacts.m,), np.uint32), self._buffers.array("wanted", (contacts.m,)), shift,
         )  # fmt: skip
         height, lifted = _move(self.spheres.place, motion, self.settings.step, shift)
         self._spare_motion, self.spheres.motion = self.spheres.motion, motion
@@ -312,41 +314,70 @@ def _along(normal: Floats, body: Indices, i: int, vector: Floats) -> float:
 
 
 @kernel
-def _push_apart(
-    normal: Floats, body: Indices, gap_ahead: Floats, u_pre: Floats, motion: Floats,
-    step: float, slop: float, share: float,
-) -> tuple[Floats, float]:  # fmt: skip
-    """Displacements that take away a share of what overlaps after the step, and the deepest overlap.
-
-    Projected Gauss-Seidel: 0 <= λ complementary to n · Δx - share (overlap - slop) >= 0.
-    """
-    shift = np.zeros((motion.shape[0], 3))
-    deep = np.empty(u_pre.size, np.int32)
-    wanted = np.empty(u_pre.size)
-    count = 0
+def _deep_overlaps(
+    normal: Floats, body: Indices, gap_ahead: Floats, begin: int, end: int, u_pre: Floats, motion: Floats,
+    step: float, slop: float, share: float, deep: Indices, wanted: Floats,
+) -> tuple[int, float]:  # fmt: skip
+    """List the overlaps of a stripe, and what to take away; returns how many, and the deepest."""
+    place = np.uint64(begin)
     deepest = 0.0
-    for i in range(u_pre.size):
+    for i in range(np.uint64(begin), np.uint64(end)):
         # The gap without contacts, less what the impact changed.
         overlap = -(gap_ahead[i] + step * (_along(normal, body, i, motion) - u_pre[i]))
         deepest = max(deepest, overlap)
-        if overlap > slop:
-            deep[count] = i
-            wanted[count] = share * (overlap - slop)
-            count += 1
-    push = np.zeros(count)
+        # No branch: a place is written again until it is taken.
+        deep[place] = i
+        wanted[place] = share * (overlap - slop)
+        place += np.uint64(overlap > slop)
+    return int(np.int64(place)) - begin, deepest
+
+
+@parallel_kernel
+def _push_apart(
+    normal: Floats, body: Indices, gap_ahead: Floats, stripe: Ints, u_pre: Floats, motion: Floats,
+    step: float, slop: float, share: float, deep: Indices, wanted: Floats, shift: Floats,
+) -> float:  # fmt: skip
+    """Displacements that take away a share of what overlaps after the step; returns the deepest overlap.
+
+    Projected Gauss-Seidel, all sweeps of a stripe in a row:
+    0 <= λ complementary to n · Δx - share (overlap - slop) >= 0.
+    `deep` and `wanted` are memory for as many entries as there are contacts.
+    """
+    count = np.zeros(stripe.size - 1, np.int32)
+    deepest = np.zeros(stripe.size - 1)
+    for k in prange(stripe.size - 1):
+        count[k], deepest[k] = _deep_overlaps(
+            normal, body, gap_ahead, stripe[k], stripe[k + 1], u_pre, motion, step, slop, share, deep, wanted
+        )
+    shift[:] = 0.0
+    for half in range(2):
+        for k in prange((stripe.size - half) // 2):
+            s = 2 * k + half
+            _push_stripe(normal, body, motion, deep, wanted, stripe[s], stripe[s] + count[s], shift)
+    return float(deepest.max())
+
+
+@kernel
+def _push_stripe(
+    normal: Floats, body: Indices, motion: Floats, deep: Indices, wanted: Floats, begin: int, end: int, shift: Floats
+) -> None:
+    """Sweeps of the correction over the overlaps of a stripe."""
+    push = np.zeros(end - begin)
+    first = np.uint64(begin)
     for _ in range(CORRECTION_SWEEPS):
-        for k in range(count):
+        for k in range(np.uint64(begin), np.uint64(end)):
             i = deep[k]
             a = body[i, 0]
             b = body[i, 1]
             wa = motion[a, 3]
             wb = motion[b, 3]
-            change = max((wanted[k] - _along(normal, body, i, shift)) / (wa + wb), -push[k])
-            push[k] += change
+            change = max((wanted[k] - _along(normal, body, i, shift)) / (wa + wb), -push[k - first])
+            push[k - first] += change
             for axis in range(3):
-                shift[a, axis] -= wa * change * normal[i, axis]
+                # All stripes share the immovable body.
+                if wa > 0.0:
+                    shift[a, axis] -= wa * change * normal[i, axis]
                 shift[b, axis] += wb * change * normal[i, axis]
-    return shift, deepest
 
 
 @parallel_kernel

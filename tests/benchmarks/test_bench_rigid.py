@@ -17,7 +17,7 @@ from scenarios.world.rigid_world import RigidWorld
 from solvers.qce_lcp import QceLcp
 from tests.rigid_scenes import CUBE, floor, world
 
-SOLVER = QceLcp(tolerance=1e-6, max_sweeps=500)
+SOLVER = QceLcp(tolerance=1e-6, max_sweeps=1000)
 # Steps in which kernels are compiled and the scene settles, and steps that are timed.
 SETTLING, TIMED = 200, 300
 

@@ -51,7 +51,7 @@ PAPER = {
 THREADS = (1, 2)
 # The error is measured at so many steps of the two cycles, evenly spread: an accurate answer takes seconds.
 SAMPLES = 16
-SWEEPS = (2, 5, 10, 20, 50, 100)
+SWEEPS = (2, 6, 10, 20, 50, 100)
 ACCURATE = Streamed(max_sweeps=1_000, tolerance=1e-9)
 # A grain whose velocity is off by more than this is told apart from those that few sweeps serve as well [√(gD)].
 OFF = 0.01
@@ -154,22 +154,25 @@ def test_step(benchmark: Any, monkeypatch: pytest.MonkeyPatch, pattern: str, res
 
 
 @pytest.mark.parametrize("restitution", [0.3, None])
-def test_error_of_few_sweeps(benchmark: Any, restitution: float | None) -> None:
+def test_error_of_few_sweeps(benchmark: Any, monkeypatch: pytest.MonkeyPatch, restitution: float | None) -> None:
     """Against a thousand sweeps: rms of the velocity error [√(gD)], and the share of grains off by more than `OFF`."""
     world = resumed("hexagons", restitution, SMALLER)
-    errors: dict[int, list[float]] = {sweeps: [] for sweeps in SWEEPS}
-    shares: dict[int, list[float]] = {sweeps: [] for sweeps in SWEEPS}
+    tried = [(sweeps, factor) for factor in (impacts.OVERSHOOT, 1.0) for sweeps in SWEEPS]
+    errors: dict[tuple[int, float], list[float]] = {way: [] for way in tried}
+    shares: dict[tuple[int, float], list[float]] = {way: [] for way in tried}
     residuals = []
     for step in range(steps_of(world)):
         if step % (steps_of(world) // SAMPLES) == 0:
             accurate = world.impact()
             residuals.append(ACCURATE.resolve(accurate).residual)
-            for sweeps in SWEEPS:
+            for sweeps, factor in tried:
                 impact = world.impact()
-                Streamed(max_sweeps=sweeps).resolve(impact)
+                with monkeypatch.context() as patch:
+                    patch.setattr(impacts, "OVERSHOOT", factor)
+                    Streamed(max_sweeps=sweeps, least_visits=0).resolve(impact)
                 square = ((impact.motion - accurate.motion)[:-1, :3] ** 2).sum(axis=1)
-                errors[sweeps].append(float(np.sqrt(square.mean())))
-                shares[sweeps].append(float((square > OFF**2).mean()))
+                errors[sweeps, factor].append(float(np.sqrt(square.mean())))
+                shares[sweeps, factor].append(float((square > OFF**2).mean()))
         world.step()
     impact = world.impact()
     law = Streamed()
@@ -178,15 +181,20 @@ def test_error_of_few_sweeps(benchmark: Any, restitution: float | None) -> None:
         f"\nhexagons, side {SMALLER} D, restitution {restitution}; "
         f"largest residual of the reference {max(residuals):.1e}"
     )
-    for sweeps in SWEEPS:
-        mean, worst, share = np.mean(errors[sweeps]), np.max(errors[sweeps]), np.mean(shares[sweeps])
-        print(f"{sweeps:4d} sweeps: rms error mean {mean:.2e}, largest {worst:.2e}; grains off by {OFF:g}: {share:.2%}")
-        benchmark.extra_info[f"{sweeps} sweeps"] = [float(mean), float(worst), float(share)]
+    for sweeps, factor in tried:
+        error, share = np.array(errors[sweeps, factor]), np.mean(shares[sweeps, factor])
+        print(
+            f"{sweeps:4d} sweeps, overshoot {factor:g}: rms error median {np.median(error):.2e}, "
+            f"mean {error.mean():.2e}, largest {error.max():.2e}; grains off by {OFF:g}: {share:.2%}"
+        )
+        benchmark.extra_info[f"{sweeps} sweeps, {factor:g}"] = [float(error.mean()), float(error.max()), float(share)]
     assert np.isfinite([*errors.values()]).all()
-    assert np.mean(errors[SWEEPS[-1]]) < np.mean(errors[SWEEPS[0]])
+    # The answer is the same; on the way the error of many sweeps is less than that of few.
+    for factor in (impacts.OVERSHOOT, 1.0):
+        assert np.mean(errors[SWEEPS[-1], factor]) < np.mean(errors[SWEEPS[0], factor])
 
 
-@pytest.mark.parametrize(("sweeps", "steps_per_cycle"), [(10, 400), (100, 400), (10, 800)])
+@pytest.mark.parametrize(("sweeps", "steps_per_cycle"), [(6, 400), (60, 400), (6, 800)])
 def test_what_accuracy_does_to_a_pattern(benchmark: Any, sweeps: int, steps_per_cycle: int) -> None:
     """Energy, overlaps and pattern of a layer by sweeps and by step; the means are over its later cycles."""
     scene = extended_pattern(pattern="hexagons", side=SMALLER, steps_per_cycle=steps_per_cycle)
@@ -201,8 +209,8 @@ def test_what_accuracy_does_to_a_pattern(benchmark: Any, sweeps: int, steps_per_
 
     benchmark.pedantic(take, rounds=PATTERN_CYCLES * steps_per_cycle)
     found = {name: np.array([measure[name] for measure in measures]) for name in measures[0]}
-    by_cycle = {"overlap [radii]": [report.overlap for report in reports]}
-    found |= {name: np.array(values).reshape(PATTERN_CYCLES, -1).max(axis=1) for name, values in by_cycle.items()}
+    overlap = np.array([report.overlap for report in reports]).reshape(PATTERN_CYCLES, -1)
+    found["deepest overlap [radii]"] = overlap.max(axis=1)
     for name in ("impact", "friction", "correction", "shaking", "integration"):
         joule = np.array([getattr(report.energy, name) for report in reports]).reshape(PATTERN_CYCLES, -1)
         found[f"{name} a grain and cycle [mgD]"] = joule.sum(axis=1) / world.spheres.count
@@ -214,4 +222,4 @@ def test_what_accuracy_does_to_a_pattern(benchmark: Any, sweeps: int, steps_per_
         later = values[PATTERN_CYCLES // 2 :]
         print(f"{name:35s} mean {later.mean():8.4f} ± {later.std():.4f}, most {later.max():8.4f}")
         benchmark.extra_info[name] = [float(value) for value in values]
-    assert found["overlap [radii]"].max() < 1.0
+    assert overlap.max() < 1.0
