@@ -22,7 +22,6 @@ import numpy as np
 import pandas as pd
 
 from harness import desiderata
-from harness.checked import ratio
 from harness.environment import describe_environment
 from harness.files import replace_file
 from harness.measure import measure_impact
@@ -56,7 +55,7 @@ STEPS, MEASURES = "series.csv", "measures.csv"
 RUN, PROBE = "run", "probe"
 """What the tasks of a simulation are: the parameter "of" of each."""
 COLUMNS = (
-    "step", "time", "contacts", "status", "iterations", "sweeps", "residual", "overlap", "fastest",
+    "step", "time", "contacts", "status", "iterations", "sweeps", "residual", "overlap", "fastest", "gain",
     "kinetic", "potential", "impact", "friction", "correction", "shaking", "integration", "wall_s",
 )  # fmt: skip
 """Columns of the series; all but wall_s come out the same whenever the run is repeated."""
@@ -425,10 +424,8 @@ def _whole_run(folder: Path, simulation: Simulation) -> Ending:
 
 
 def _energy_scores(column: Mapping[str, Floats]) -> Iterator[Score]:
-    """KIN over all steps: work of all impulses over the kinetic energy before them."""
-    work = column["impact"] + column["friction"]
-    before = column["kinetic"] - work
-    change = np.array([ratio(abs(w), k) * math.copysign(1.0, w) for w, k in zip(work, before, strict=True)])
+    """KIN over all steps: kinetic energy that the impulses of an impact gained, over that before them."""
+    change = column["gain"]
     worst = int(change.argmax())
     yield upper_bound(
         "KIN", "energy gained in an impact", float(max(change[worst], 0.0)), desiderata.ENERGY_TOLERANCE,

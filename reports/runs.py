@@ -34,7 +34,7 @@ LAST_FRAMES = 300
 ACROSS = 4
 MARGIN = 0.5
 # Letters of an axis label that fit beside a panel; a longer one is broken into lines.
-LABEL_WIDTH = 26
+LABEL_WIDTH = 20
 
 
 def results_of(store: Frames) -> Results:

@@ -39,8 +39,9 @@ START_GAP = 1e-6
 # Radius of a ball as a share of a card's length, the height over the house from which it falls, in lengths, its density
 # over that of the cards, and how far to each side of the middle it falls: between the outer pairs of the lowest storey.
 BALL, FALL, HEAVY, BESIDE = 0.2, 0.6, 5.0, 1.0
-# A card that a ball flings away moves by more than half its thickness in a step; contacts are seen two steps ahead.
-LARGEST_MOVE = 1.8
+# A card that a ball flings away moves by up to its thickness in a step. Contacts are looked for as far as bodies move,
+# so that it passes through nothing; it turns by 0.03 rad at most, which bends the way of its end by 2 mm.
+LARGEST_MOVE = 3.0
 # A card that has moved by less than this share of its length is in its place.
 IN_PLACE = 0.1
 # The cards are at rest when this share of the peak of their kinetic energy is left.

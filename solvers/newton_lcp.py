@@ -20,7 +20,11 @@ from solvers.solution import Floats, ImpactSolution, Status
 
 @dataclass(frozen=True)
 class NewtonLcp:
-    """Simultaneous impacts as an LCP by projected Gauss-Seidel, with friction; one iteration is one sweep."""
+    """Simultaneous impacts as an LCP by projected Gauss-Seidel, with friction; one iteration is one sweep.
+
+    With friction, small problems on which sweeps creep go on in proximal Newton steps; their iterations count as
+    sweeps.
+    """
 
     tolerance: float = 1e-11
     """Natural-map residual at which to stop, relative to the largest |u_pre|."""

@@ -15,7 +15,7 @@ from scenarios.world.container import Container
 from scenarios.world.grid import find_contacts
 from scenarios.world.impact import ByProblem, Constant, Impact, Resolver
 from scenarios.world.spheres import Spheres
-from scenarios.world.stepping import Ledger, StepReport
+from scenarios.world.stepping import Ledger, StepReport, relative_gain
 from solvers import ImpactProblem, ProblemError
 from solvers.solution import Floats
 
@@ -139,6 +139,7 @@ class EventWorld:
             solution.residual,
             0.0,
             float(np.sqrt((self.spheres.velocity**2).sum(axis=1).max())),
+            relative_gain(before, kinetic),
             Ledger(kinetic, potential, impact, kinetic - before - impact, 0.0, 0.0, 0.0),
         )
 

@@ -55,7 +55,7 @@ from scenarios.world.rigid_rows import (
 from scenarios.world.rotation import inverse, multiply, rotation_matrix
 from scenarios.world.shapes import Faces, Shape
 from scenarios.world.spheres import Ints, Spheres
-from scenarios.world.stepping import Ledger, StepReport
+from scenarios.world.stepping import Ledger, StepReport, relative_gain
 from solvers import ImpactProblem, ImpactSolution, ProblemError, Solver
 from solvers.solution import Floats
 
@@ -387,6 +387,7 @@ class RigidWorld:
             step=self.steps, time=self.time, contacts=problem.m, status=solution.status,
             iterations=solution.iterations, sweeps=0, residual=solution.residual,
             overlap=self.overlap / self._thinnest, fastest=fastest,
+            gain=relative_gain(self._kinetic(impact.velocity), struck),
             energy=Ledger(
                 kinetic=kinetic, potential=potential, impact=normal, friction=work - normal,
                 correction=potential - drifted[1], shaking=0.0, integration=integration,

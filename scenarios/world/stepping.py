@@ -114,7 +114,16 @@ class StepReport:
     """Deepest overlap that the step left, over the smallest radius, before the correction."""
     fastest: float
     """Largest speed after the step [m/s]."""
+    gain: float
+    """Kinetic energy that the impact's impulses gained, over that before them, gravity's share of the step included."""
     energy: Ledger
+
+
+def relative_gain(before: float, after: float) -> float:
+    """Gain of an energy over what it was; 0 where there was and is none, and infinite where it came from nothing."""
+    if before > 0.0:
+        return (after - before) / before
+    return 0.0 if after <= 0.0 else np.inf
 
 
 @dataclass
@@ -215,6 +224,7 @@ class World:
         self.steps += 1
         if self.spheres.count >= RENUMBERED and self.steps % RENUMBER_EVERY == 0:
             self.spheres.renumber(contacts.order)
+        ledger = self._ledger(before, after, height, lifted, outcome.normal_work)
         return StepReport(
             self.steps,
             self.time,
@@ -225,7 +235,8 @@ class World:
             outcome.residual,
             overlap / self._smallest,
             float(np.sqrt(after[FASTEST])),
-            self._ledger(before, after, height, lifted, outcome.normal_work),
+            relative_gain(ledger.kinetic - ledger.impact - ledger.friction, ledger.kinetic),
+            ledger,
         )
 
     def _kick(self) -> float:
