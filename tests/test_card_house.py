@@ -76,6 +76,10 @@ def test_the_house_is_its_own_mirror_image() -> None:
     assert sorted(map(tuple, place.round(9) + 0.0)) == sorted(map(tuple, mirrored.round(9) + 0.0))
 
 
+# Of the eight cards that lean in the lowest storey two pairs may stay: no ball falls on the outer ones.
+STAY = 4
+
+
 @pytest.mark.parametrize("law", LAWS)
 def test_a_small_house_stands(law: str) -> None:
     assert moved_after(started(LAWS[law], **SMALL), 0.3, **SMALL) < 1e-3
@@ -157,7 +161,7 @@ def test_24_cards_stand_for_ten_seconds_then_fall_and_come_to_rest(law: str) -> 
         f"the highest at {measures['height of the highest card [m]']:.2f} m"
     )
     assert moved < STANDS
-    assert measures["cards in their place"] <= 2
+    assert measures["cards in their place"] <= STAY
     assert unsolved <= UNSOLVED * (world.steps - 10_000)
     assert cards_energy(cards, world) < AT_REST * peak
 
