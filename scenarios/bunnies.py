@@ -21,7 +21,7 @@ from scenarios.world.moving_scene import STAGES_FIRED, MovingScene, MovingWorld
 from scenarios.world.rigid_bodies import RigidBody
 from scenarios.world.rigid_world import RigidSettings, RigidWorld, Trigger
 from scenarios.world.rotation import about, rotation_matrix
-from scenarios.world.shapes import Shape, half_space, mesh, mesh_of_parts
+from scenarios.world.shapes import Shape, extra, half_space, mesh, mesh_of_parts
 from solvers import SOLVERS, ImpactProblem, ProblemError
 from solvers.solution import Floats
 
@@ -205,13 +205,11 @@ def _fired(stages: int, measures: Mapping[str, float]) -> bool:
 @cache
 def bunny() -> Shape:
     """A sitting bunny that looks along +x, 1.1 m tall, in six convex parts."""
-    from skimage.measure import marching_cubes
-
     low = np.array(LOW)
     cells = np.ceil((np.array(HIGH) - low) / CELL).astype(int) + 1
     grid = np.stack(np.meshgrid(*[low[k] + CELL * np.arange(cells[k]) for k in range(3)], indexing="ij"), axis=-1)
     surface = -np.log(np.exp(-SHARPNESS * _distances(grid.reshape(-1, 3))).sum(axis=0)) / SHARPNESS
-    corners, faces, _, _ = marching_cubes(surface.reshape(cells), 0.0)
+    corners, faces, _, _ = extra("skimage.measure").marching_cubes(surface.reshape(cells), 0.0)
     vertices = low + CELL * corners.astype(np.float64)
     part = np.array([ellipsoid[-1] for ellipsoid in ELLIPSOIDS])[_distances(vertices).argmin(axis=0)]
     pieces = [_thinned(vertices[part == number]) for number in range(part.max() + 1)]
@@ -267,6 +265,7 @@ def loaded(file: str) -> Shape:
         ProblemError: the file is missing, of an unknown format, or its mesh not closed; names the body and the field.
     """
     try:
-        return mesh(Path(file), scale=bunny().radius / mesh(Path(file), concavity=1.0).radius)
+        radius = mesh(Path(file), concavity=1.0).radius
+        return mesh(Path(file), scale=bunny().radius / radius)
     except ProblemError as error:
         raise ProblemError(f"body bunny 0: mesh: {error}") from None

@@ -39,7 +39,7 @@ rms distance 0.016 instead of 0.013 from 32 steps a contact and gap_memory 0.01 
 Friction: P_t opposes the slip with |P_t| ≤ μ P over both directions (Coulomb's cone, which lies within the pyramid),
 and never reverses it: P_t is at most slip / Σ_j ‖D_i M⁻¹ D_jᵀ‖, a part of it at a time. Where c_r = 1 half of the parts
 come before the normal pushes and half after them, as in any symmetric splitting; all of them afterwards left an error
-of the energy of first order, and rounds were run again at finer and finer steps (7 to 14 times as many in hot packs).
+of the energy of first order, and rounds were run again at finer and finer steps.
 
 Two layouts run the same rounds: `explicit_hertz_rows` any rows, with local steps; `explicit_hertz_spheres` many elastic
 contacts of spheres, with one step for all, which grows as speeds fall, and several threads.
@@ -51,10 +51,10 @@ is left. Contacts with c_r = 1 beside others with less also settle without rebou
 both sides nothing need end (Gordan), and max_steps does. Settling is slow on long rows of balls with c_r = 0: 1,000 of
 them are left at an approach of 6e-8 after a million sweeps, and the bound is told as such.
 
-Measured on the dense layer, kick, rms velocity error (4,000 spheres): 0.091 with 1.75 steps a contact and gap_memory
-0.3, 0.035 with 2.5 and 0.1, 0.019 with 3 and 0.05. Below 1.75 steps the method is unstable. That packed spheres let
-their step grow as the speeds fall saves 10 to 18 % of the visits at these errors; by the fastest contact alone, in
-place of the sum over contacts, it saves none, as single contacts get faster than any was at the start.
+Measured on the dense layer, kick, rms velocity error (4,000 spheres, `tests/benchmarks/test_bench_ehi.py`): 0.091 with
+1.75 steps a contact and gap_memory 0.3, 0.035 with 2.5 and 0.1, 0.019 with 3 and 0.05. Below 1.75 steps the method is
+unstable. Packed spheres let their step grow as the speeds fall; growing it by the fastest contact alone, in place of
+the sum over contacts, saves no visits, as single contacts get faster than any was at the start.
 
 Tried and left, each by a prototype that lost: implicit midpoint, its force at the middle or as the mean over the step
 (several times the visits at the same error, and no solution in large steps); the energy of each contact as its state

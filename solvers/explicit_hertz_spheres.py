@@ -323,7 +323,7 @@ def _powers_of_chunk(
 ) -> tuple[float, float]:
     """Fill in a chunk's relative velocities, and sum.
 
-    The sums keep the compiler from gathering by vectors, which processors guard against leaks at four times the time.
+    The sums keep the compiler from gathering by vectors, which processors guard against leaks at a cost.
     """
     a = 0.0
     b = 0.0

@@ -36,7 +36,7 @@ Indices = npt.NDArray[np.uint32]
 
 # Velocities that are eliminated together: those of a rigid body. Any other number is correct, too, but slower.
 BLOCK = 6
-# The same for columns, which are unsigned: a division of signed numbers takes several times as long.
+# The same for columns, which are unsigned: a division of signed numbers takes longer.
 WIDTH = np.uint32(BLOCK)
 # Products of blocks in one elimination, each of `BLOCK`³ multiplications; larger problems are left to sweeps.
 LARGEST = 100_000

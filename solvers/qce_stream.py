@@ -6,8 +6,7 @@ Only neighbors with s_j < s_i matter to contact i, hence the ends are unique and
 until nothing changes gives what `qce_heap` gives, which pops the earliest end first. The speed comes from
 
 - the order: contacts are sorted, coarsely, by the end that they would have if no neighbor ended before them, and what
-  an evaluation puts in doubt is evaluated again before long. Most ends are then found after all that they depend on:
-  1.05 to 1.16 evaluations an end (sphere packs of 3,000 to 183,000 contacts);
+  an evaluation puts in doubt is evaluated again before long. Most ends are then found after all that they depend on;
 - one root: with the neighbors that end before it known, the end is the root of one quadratic about s = 0,
 
       ½ A s² + (B - F) s - ½ C = 0,   A = Σ_late c_j,  B = Σ_early c_j s_j,  C = Σ_early c_j s_j²,   c_j = W_ij F_j
@@ -19,8 +18,8 @@ until nothing changes gives what `qce_heap` gives, which pops the earliest end f
 
       A s² + Σ_{c_j > 0} c_j s_j² + Σ_{c_j < 0} c_j (2 s s_j - s_j²) > 0        (sums over early neighbors)
 
-  About nine evaluations in ten pass (sphere packs). Where only a neighbor is on the wrong side of the root, the root
-  with the others is tried; the rest, 7 to 9 in a hundred, go through time piece by piece, as the heap does;
+  Most evaluations pass. Where only a neighbor is on the wrong side of the root, the root with the others is tried; the
+  rest go through time piece by piece, as the heap does;
 - no heap, no W: only the couplings of contacts that are active together, for one outer iteration.
 
 No slope is updated by subtraction: the couplings of all neighbors still active are summed anew in each evaluation
@@ -61,11 +60,9 @@ NEVER = float(np.finfo(np.float64).max)
 KEY_BITS = 48
 KEYS = 512
 # The contacts are sorted and evaluated in tiles of so many at most. Smaller ones, which would stay in the second-level
-# cache, cost more evaluations, as neighbors in a later tile are not known: 1.19 an end with 8,192, 1.10 with these
-# (kick, 183,000 contacts).
+# cache, cost more evaluations than that saves, as neighbors in a later tile are not known.
 TILE = 32_768
-# So many are evaluated, then those that they woke: what comes later in the order meets ends that are right. Without
-# that, 1.16 evaluations an end instead of 1.05 (kick, 12,000 contacts).
+# So many are evaluated, then those that they woke: what comes later in the order meets ends that are right.
 CHUNK = 256
 # So many contacts are searched, then those of them that approach are packed: they are still in the cache.
 BLOCK = 2048

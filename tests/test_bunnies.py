@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import importlib.util
 import time
 from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from scipy.spatial import ConvexHull
 
+import impactbench
 from scenarios.bunnies import (
     AT_REST,
     OUTLINE,
@@ -119,6 +122,20 @@ def test_a_mesh_that_is_not_there_or_not_closed_is_refused(tmp_path: Path) -> No
     trimesh.Trimesh(shape.vertices, shape.faces[:-1]).export(path)
     with pytest.raises(ProblemError, match="must be closed"):
         bunnies_and_pawns(bunnies=1, pawns=0, mesh=str(path))
+
+
+@pytest.mark.parametrize("scene", ["bunnies-and-pawns", "bunnies-and-pawns:mesh=brick.stl", "card-house"])
+def test_without_the_extra_a_rigid_scene_says_what_to_install(
+    scene: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "brick.stl").write_bytes(b"solid")
+    for shape in (bunny, pawn, loaded):
+        shape.cache_clear()
+    result = CliRunner().invoke(impactbench.main, ["simulate", scene, "--out", "out"])
+    assert result.exit_code == 2, result.output
+    assert "pip install 'impactbench[scenes]'" in " ".join(result.output.split())
 
 
 def test_the_energy_error_is_that_of_the_elastic_step() -> None:

@@ -31,7 +31,7 @@ def wave_times_here() -> list[float]:
         )
         for k in range(DOMINOS)
     ]  # fmt: skip
-    moving = world([floor(FRICTION), *row], QceLcp(tolerance=1e-6, max_sweeps=1000), step=5e-4)
+    moving = world([floor(FRICTION), *row], QceLcp(tolerance=1e-6, max_sweeps=500), step=5e-4)
     times = np.full(DOMINOS, np.nan)
     while np.isnan(times[-1]) and moving.time < 1.5:
         moving.step()
@@ -82,12 +82,12 @@ def test_a_row_of_dominos_falls_as_fast_as_in_an_independent_simulator(capsys: p
 @pytest.mark.parametrize("count", [10, 50])
 def test_a_stack_stands(count: int) -> None:
     boxes = [RigidBody(f"box {k}", CUBE, (0.0, 0.0, 0.5 + k)) for k in range(count)]
-    moving = world([floor(), *boxes], QceLcp(tolerance=1e-8, max_sweeps=1000))
+    moving = world([floor(), *boxes], QceLcp(tolerance=1e-6, max_sweeps=500))
     start = moving.position.copy()
     reports = run(moving, 2.0)
     # A millionth of a box's side.
     assert np.abs(moving.position - start).max() <= 1e-6
-    assert max(report.residual for report in reports) <= 1e-8
+    assert max(report.residual for report in reports) <= 1e-6
     assert moving.kinetic_energy() <= 1e-12
 
 

@@ -294,7 +294,7 @@ _NO_CONTACTS = np.zeros(0, dtype=np.int32)
 @kernel
 def _relative_velocities(normal: Floats, body: Indices, motion: Floats, begin: int, end: int, u: Floats) -> None:
     """Normal relative velocity of some contacts."""
-    # Unsigned: with a signed index these gathers are not vectorized, and cost eight times as much (130,000 contacts).
+    # Unsigned: with a signed index these gathers are not vectorized, and cost several times as much.
     for i in range(np.uint64(begin), np.uint64(end)):
         a = body[i, 0]
         b = body[i, 1]

@@ -20,6 +20,7 @@ from scenarios.world.collision import RigidContacts
 from scenarios.world.spheres import Ints
 from solvers import ImpactProblem
 from solvers._jit import kernel
+from solvers.boxed_lcp import sweep
 from solvers.problem import Matrix
 from solvers.solution import Floats
 
@@ -27,6 +28,8 @@ Flags = npt.NDArray[np.bool_]
 
 # Sliding slower than this share of the normal velocity says nothing of a direction: what lies still has rounding there.
 SLIDING = 1e-3
+# Natural map of a first guess for what rests, relative to the fastest approach, and sweeps until then at most.
+HELD, HOLDING = 1e-9, 60
 # A force that passes an axle so near, as the square of a share of its arm, does not turn the body: rounding.
 DEAD = 1e-12
 
@@ -99,15 +102,25 @@ class RigidImpact:
         plain, weighted = _as_csr(self.contacts.body, self.rows.block, self.inverse_mass, first, last)
         return _csr(plain, n), _csr(weighted, n)
 
-    def starts(self, impulse: Floats) -> tuple[Floats, Floats]:
+    def starts(self, problem: ImpactProblem, impulse: Floats) -> tuple[Floats, Floats]:
         """First guesses of λ, shape (m,), and of λ_f, shape (2m,).
 
+        Where nothing bounces the last step's impulses are carried further than a law's own tolerance: what rests would
+        creep by as much as it leaves. The law that is given the guess makes its own test.
+
         Args:
+            problem: of this impact.
             impulse: of the step before, in space [N s], shape (m, 3).
         """
         axes = np.concatenate([self.contacts.normal[:, None], self.rows.tangent], axis=1)
         guess = np.ascontiguousarray(np.einsum("mtx,mx->mt", axes, impulse))
-        return guess[:, 0], guess[:, 1:].ravel()
+        normal, friction = guess[:, 0], guess[:, 1:].ravel()
+        if self.restitution.any() or not problem.has_friction:
+            return normal, friction
+        held = sweep(
+            problem, np.zeros(problem.m), tolerance=HELD, max_sweeps=HOLDING, start=normal, friction_start=friction
+        )  # fmt: skip
+        return held.impulse, friction if held.friction_impulse is None else held.friction_impulse
 
     def in_space(self, impulse: Floats, friction_impulse: Floats | None) -> Floats:
         """Impulses of normal and friction together as vectors on the second bodies [N s], shape (m, 3)."""

@@ -417,7 +417,7 @@ class RigidWorld:
         solve: Callable[..., ImpactSolution] = self.solver.solve
         if "start" not in self._takes:
             return solve(problem)
-        guesses = zip(("start", "friction_start"), impact.starts(last.impulse), strict=True)
+        guesses = zip(("start", "friction_start"), impact.starts(problem, last.impulse), strict=True)
         return solve(problem, **{name: guess for name, guess in guesses if name in self._takes})
 
     def _move(self, impact: RigidImpact, velocity: Floats) -> None:

@@ -437,11 +437,12 @@ def _trimesh() -> Any:
 
 
 def extra(name: str) -> Any:
-    """A module of the extra `scenes`.
+    """A module of the extra `scenes`, or a part of one ("skimage.measure").
 
     Raises:
         ProblemError: it is not installed.
     """
-    if importlib.util.find_spec(name) is None:
-        raise ProblemError(f"rigid bodies need {name}: pip install 'impactbench[scenes]'")
+    package = name.partition(".")[0]
+    if importlib.util.find_spec(package) is None:
+        raise ProblemError(f"rigid bodies need {package}: pip install 'impactbench[scenes]'")
     return importlib.import_module(name)
