@@ -636,7 +636,7 @@ GATE_EXIT_CODES = """
 Exit codes:
   0    nothing got worse
   1    a number got worse by more than its allowance, or a solver × scene of the baseline has no answer any more
-  2    bad usage or input: no such file, another schema version, tier or seed, an unknown metric, unusable results
+  2    bad usage or input: no such file, another version, machine, tier or seed, an unknown metric, unusable results
   130  interrupted; the same command goes on where it stopped
 """
 
@@ -665,11 +665,12 @@ def _gate_options(command: Command) -> Command:
 
 @main.command(epilog=GATE_EXIT_CODES)
 @_gate_options
+@click.option("--foreign", is_flag=True, help="Take a FILE of another version, architecture or operating system.")
 @click.option("--against", metavar="REVISION", help="Time every solve against this commit too, in turns, in this job.")
 @click.option("--report", type=click.Path(dir_okay=False, path_type=Path), help="Write the tables as Markdown too.")
 def check(
-    baseline: Path, tier: str | None, solvers: tuple[str, ...], out: Path, against: str | None, report: Path | None,
-    **options: Any,
+    baseline: Path, tier: str | None, solvers: tuple[str, ...], out: Path, foreign: bool, against: str | None,
+    report: Path | None, **options: Any,
 ) -> None:  # fmt: skip
     """Compare energy error, momentum, one-sidedness, symmetry, residuals and counted work with an accepted baseline.
 
@@ -684,11 +685,14 @@ def check(
     """  # noqa: D301
     with _explained_errors():
         from harness import baseline as gate
+        from harness.environment import describe_environment
         from harness.revision import find_commit
         from reports.gate import gate_markdown, render_gate, render_times
 
         accepted = gate.read_baseline(baseline)
         gate.check_same_run(accepted, tier=tier or accepted.tier, seed=accepted.seed)
+        if not foreign:
+            gate.check_same_kind(accepted, describe_environment())
         if against:
             find_commit(against)
         plan = gate.plan_gate(tier=accepted.tier, seed=accepted.seed, solvers=solvers or accepted.solvers)

@@ -5,8 +5,9 @@
 An absolute tolerance would pass an energy error that grew from 2e-9 to 1e-8; a factor of five is a factor of five here.
 Below the floor (eps the spacing of float64 at 1, m the contacts of the scene) everything is rounding. Gated are the
 single impacts of one tier: energy, momentum, one-sidedness, symmetry, residuals, termination, and counted work. They
-are deterministic up to rounding, so that a baseline of another machine holds as well; it is named in the report. Wall
-time is in no baseline: `harness.revision` compares it with another commit within one job.
+are deterministic up to rounding: a baseline of another processor of the same kind holds, and is named in the report;
+one of another architecture, operating system or version of impactbench is refused unless it is asked for. Wall time is
+in no baseline: `harness.revision` compares it with another commit within one job.
 """
 
 from __future__ import annotations
@@ -68,6 +69,9 @@ _FLOORS = dict.fromkeys(("symmetry residual", "renumbering residual"), SYMMETRY_
 METRICS = (*_METRICS.values(), WORK)
 """What is gated, beside every metric that begins with RESIDUAL."""
 
+# The environment's entries in which a baseline must agree with the machine it is used on, with their names. Of the
+# operating system the kind counts, not the release.
+_KIND = {"impactbench": "version of impactbench", "machine": "architecture", "os": "operating system"}
 _ENVIRONMENT = ("impactbench", "source", "commit", "python", "numpy", "scipy", "numba", "cpu", "machine", "os")
 
 Pair: TypeAlias = tuple[str, str]
@@ -359,6 +363,25 @@ def check_same_run(baseline: Baseline, *, tier: str, seed: int) -> None:
     for what, accepted, now in (("tier", baseline.tier, tier), ("seed", baseline.seed, seed)):
         if accepted != now:
             raise BaselineError(f"the baseline is of {what} {accepted}, not {now}: they cannot be compared")
+
+
+def check_same_kind(baseline: Baseline, environment: Mapping[str, object]) -> None:
+    """Refuse a baseline of another version or kind of machine.
+
+    Args:
+        baseline: what was accepted.
+        environment: where it is compared.
+
+    Raises:
+        BaselineError: names what differs, and what to do.
+    """
+    for key, name in _KIND.items():
+        accepted, now = (str(found.get(key)).partition(" ")[0] for found in (baseline.environment, environment))
+        if accepted != now:
+            raise BaselineError(
+                f"the baseline is of another machine or version: {name} {accepted}, not {now}; accept one here with "
+                "`impactbench accept`, or compare all the same with --foreign"
+            )
 
 
 def latest_environment(store: Frames) -> dict[str, object]:

@@ -1,12 +1,12 @@
 """What a run of `extended-pattern` has to show, small enough to keep: its height maps and its statistics.
 
     PATTERN.npz
-        cycle     (maps,)            cycles of the plate since the start, every tenth
+        cycle     (maps,)            cycles of the plate since the start: every tenth, and the last where it is odd
         height    (maps, 100, 100)   highest surface above the plate in each cell, uint16 in D/100; 0 where no grain is
         run       ()                 JSON: scene, solver, seed, statistics of all steps, machine
 
-All maps are of the same phase: the beginning of a cycle, when the plate goes up through its middle. Patterns repeat
-every two cycles, so that maps ten cycles apart also show the same one of the two.
+All maps are of the beginning of a cycle, when the plate goes up through its middle. Patterns repeat every two cycles:
+maps ten cycles apart show the same one of the two, and a run of an odd number of cycles ends with a map of the other.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import io
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -45,7 +46,7 @@ class PatternRecord:
     run: Mapping[str, Any]
     """JSON-able: scene, pattern, side, solver, seed, steps, statistics, machine."""
     cycles: npt.NDArray[np.int64]
-    """Shape (maps,)."""
+    """Shape (maps,); a last one that is odd is of the other phase."""
     heights: Floats
     """Above the plate [D], NaN where no grain is; shape (maps, cells, cells)."""
 
@@ -59,6 +60,12 @@ class PatternRecord:
         """Of the box [D]."""
         return float(self.run["side"])
 
+    @property
+    def tenths(self) -> int:
+        """How many maps, from the first on, are of one phase."""
+        return int((self.cycles % 2 == 0).sum())
+
+    @cached_property
     def measures(self) -> list[Pattern]:
         """What each map shows."""
         return [measure_pattern(heights, self.side) for heights in self.heights]
@@ -79,11 +86,16 @@ def record_of_run(folder: Path) -> PatternRecord:
     if scene.name != SCENE:
         raise StoreError(f"{folder} holds a run of {scene.name}, not of {SCENE}")
     side = float(str(scene.parameters["side"]))
-    maps = {
-        frame.step // scene.steps_per_cycle: height_map(frame.place.astype(np.float64), side)
-        for frame in read_frames(folder)
-        if frame.step > 0 and frame.step % (EVERY * scene.steps_per_cycle) == 0
-    }
+    maps, last = {}, None
+    for frame in read_frames(folder):
+        cycle, rest = divmod(frame.step, scene.steps_per_cycle)
+        if frame.step == 0 or rest:
+            continue
+        if cycle % EVERY == 0:
+            maps[cycle] = height_map(frame.place.astype(np.float64), side)
+        last = (cycle, frame)
+    if maps and last is not None and last[0] % 2:
+        maps[last[0]] = height_map(last[1].place.astype(np.float64), side)
     if not maps:
         raise StoreError(f"{folder} has no frame at the beginning of a tenth cycle: run more cycles, with --frames "
                          f"{EVERY * scene.steps_per_cycle}")  # fmt: skip

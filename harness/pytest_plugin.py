@@ -24,6 +24,7 @@ import pytest
 
 from harness import baseline as gate
 from harness import conformance
+from harness.environment import describe_environment
 from harness.isolation import Limits
 from harness.run import measure
 from harness.store import Store
@@ -43,7 +44,7 @@ class ImpactGate(Protocol):
 
         Raises:
             AssertionError: a number got worse, or an answer is missing; the text lists all of them.
-            BaselineError: the file cannot be used, or has no entry of this solver.
+            BaselineError: the file cannot be used, is of another kind of machine, or has no entry of this solver.
         """
         ...
 
@@ -60,6 +61,7 @@ def impact_gate(tmp_path: Path) -> ImpactGate:
 
     def check(solver: str, *, baseline: str | os.PathLike[str], jobs: int = 1) -> gate.Comparison:
         accepted = gate.read_baseline(Path(baseline))
+        gate.check_same_kind(accepted, describe_environment())
         plan = gate.plan_gate(tier=accepted.tier, seed=accepted.seed, solvers=[solver])
         chosen = sorted({planned.task.solver for planned in plan})
         gate.gated_entries(accepted, chosen)

@@ -1,9 +1,9 @@
 """Patterns of vibrated layers beside those of Bizon 1998, from their records alone: nothing is computed again.
 
 patterns.md                     what each run shows, cycle by cycle, and Table 2 of Zhang 2015 beside ours
-patterns.(pdf|svg|png)          last height map of each run, as Fig. 9 of Zhang 2015
+patterns.(pdf|svg|png)          last height map of each run, as Fig. 9 of Zhang 2015, and of the cycle after it
 pattern_growth.(…)              five maps of each run, from its first to its last
-pattern_measures.(…)            wavelength, Q2, Q4, Q6 and roughness over the cycles
+pattern_measures.(…)            all measures over the cycles
 """
 
 from __future__ import annotations
@@ -28,6 +28,13 @@ from scenarios.patterns import Pattern
 
 COLORS = {"squares": VERMILLION, "stripes": BLUE, "hexagons": GREEN, "flat": BLACK}
 MARKERS = {"squares": "s", "stripes": "^", "hexagons": "o", "flat": "."}
+MEASURES = {
+    "wavelength": "wavelength [D]", "q2": "Q2", "q4": "Q4", "q6": "Q6", "psi4": "ψ4", "psi6": "ψ6",
+    "skewness": "skewness", "roughness": "roughness [D]",
+}  # fmt: skip
+"""Attribute of `Pattern` → its name."""
+DIGITS = {"wavelength": 1, "q2": 3, "q4": 3, "q6": 3}
+"""Decimals of a measure; two of the others."""
 # Width of one of four panels side by side [in].
 PANEL = TWO_COLUMNS / 4
 # Maps of a run in the figure of its growth.
@@ -53,7 +60,7 @@ def write_patterns(records: Sequence[PatternRecord], folder: Path) -> list[Path]
     """Write the page and the figures of some runs.
 
     Args:
-        records: one a pattern.
+        records: one for each pattern.
         folder: where to.
 
     Raises:
@@ -80,8 +87,13 @@ def patterns_markdown(records: Sequence[PatternRecord]) -> str:
         "`scenarios/patterns.py` says. Published: the panels of Bizon et al. 1998 by the same measure; \"cycles\" is "
         "when a run of the first author showed the pattern. Lengths are in mean diameters D of a grain.",
         "",
+        "Q2, Q4 and Q6 are the published recipe: order of the whole map. ψ4 and ψ6 are the order about each peak away "
+        "from the walls (1 for four, or six, neighbors at equal angles; about 0.5 both for few peaks at random). "
+        "Skewness is that of the heights: in hexagons one cycle shows peaks (> 0) and the next one cells (about 0 and "
+        "less), squares and stripes show the same in both.",
+        "",
         *markdown_table(
-            ("pattern", "whose", "cycles", "wavelength", "Q2", "Q4", "Q6", "roughness", "pattern stands"),
+            ("pattern", "whose", "cycle", *MEASURES.values(), "pattern stands"),
             [row for record in records for row in _comparison_rows(record)],
         ),
         "",
@@ -105,7 +117,7 @@ def patterns_markdown(records: Sequence[PatternRecord]) -> str:
 def standing_since(record: PatternRecord) -> int | None:
     """First stored cycle from which on every map shows the pattern; None if the last one does not."""
     since = None
-    for cycle, found in zip(record.cycles, record.measures(), strict=True):
+    for cycle, found in zip(record.cycles[: record.tenths], record.measures, strict=False):
         if not shows(record.pattern, named_measures(found)):
             since = None
         elif since is None:
@@ -115,20 +127,25 @@ def standing_since(record: PatternRecord) -> int | None:
 
 def _comparison_rows(record: PatternRecord) -> Iterator[tuple[str, ...]]:
     """The last map beside the published panel."""
-    panel, found = PUBLISHED[record.pattern], record.measures()[-1]
+    panel, last = PUBLISHED[record.pattern], record.tenths - 1
     if record.pattern == "flat":
         stands = "none is expected"
     else:
         since = standing_since(record)
         stands = f"from cycle {since} on" if since is not None else "no"
-    yield (
-        record.pattern, "here", str(record.cycles[-1]), f"{found.wavelength:.1f}", f"{found.q2:.3f}", f"{found.q4:.3f}",
-        f"{found.q6:.3f}", f"{found.roughness:.2f}", stands,
-    )  # fmt: skip
-    yield (
-        "", "Bizon 1998", str(panel.cycles or "–"), f"{panel.wavelength or '–'}", f"{panel.q2:.3f}", f"{panel.q4:.3f}",
-        f"{panel.q6:.3f}", "–", "",
-    )  # fmt: skip
+    yield record.pattern, "here", str(record.cycles[last]), *_numbers(record.measures[last]), stands
+    if last < len(record.cycles) - 1:
+        yield "", "here, the other phase", str(record.cycles[-1]), *_numbers(record.measures[-1]), ""
+    published = (f"{value:.3f}" for value in (panel.q2, panel.q4, panel.q6))
+    yield "", "Bizon 1998", str(panel.cycles or "–"), f"{panel.wavelength or '–'}", *published, "–", "–", "–", "–", ""
+
+
+def _numbers(found: Pattern) -> Iterator[str]:
+    """All measures of a map."""
+    for name in MEASURES:
+        value = getattr(found, name)
+        digits = DIGITS.get(name, 2)
+        yield f"{value:.{digits}f}" if np.isfinite(value) else "–"
 
 
 def _thresholds() -> str:
@@ -170,13 +187,10 @@ def _run_lines(record: PatternRecord) -> Iterator[str]:
         "",
     )
     yield from markdown_table(
-        ("cycle", "wavelength", "share", "roughness", "Q2", "Q4", "Q6", "shows the pattern"),
+        ("cycle", *MEASURES.values(), "share", "shows the pattern"),
         [
-            (
-                str(cycle), f"{found.wavelength:.1f}", f"{found.share:.2f}", f"{found.roughness:.2f}",
-                f"{found.q2:.3f}", f"{found.q4:.3f}", f"{found.q6:.3f}", _shown(record, found),
-            )
-            for cycle, found in zip(record.cycles, record.measures(), strict=True)
+            (str(cycle), *_numbers(found), f"{found.share:.2f}", _shown(record, found))
+            for cycle, found in zip(record.cycles, record.measures, strict=True)
         ],
     )  # fmt: skip
     yield ""
@@ -207,22 +221,26 @@ def _draw_map(axes: Axes, record: PatternRecord, k: int) -> None:
 
 
 def _panels_figure(records: Sequence[PatternRecord]) -> Figure:
-    """Last map of each run."""
-    figure = Figure(figsize=(PANEL * len(records), 2.5), layout="constrained")
-    panels = figure.subplots(1, len(records), squeeze=False)[0]
-    for axes, record, letter in zip(panels, records, "abcd", strict=False):
-        _draw_map(axes, record, -1)
-        axes.set_title(f"({letter}) {record.pattern}, cycle {record.cycles[-1]}")
+    """Last map of each run, and below it that of the other phase where it is kept."""
+    rows = 2 if any(record.tenths < len(record.cycles) for record in records) else 1
+    figure = Figure(figsize=(PANEL * len(records), 2.5 * rows), layout="constrained")
+    panels = figure.subplots(rows, len(records), squeeze=False)
+    for column, record, letter in zip(panels.T, records, "abcd", strict=False):
+        for axes, k in zip(column, range(record.tenths - 1, len(record.cycles)), strict=False):
+            _draw_map(axes, record, k)
+            axes.set_title(f"({letter}) {record.pattern}, cycle {record.cycles[k]}")
+        for axes in column[len(record.cycles) - record.tenths + 1 :]:
+            axes.set_visible(False)
     return _laid_out(figure)
 
 
 def _growth_figure(records: Sequence[PatternRecord]) -> Figure:
     """Maps of each run at cycles that grow by a factor."""
-    columns = min(STAGES, max(len(record.cycles) for record in records))
+    columns = min(STAGES, max(record.tenths for record in records))
     figure = Figure(figsize=(TWO_COLUMNS / STAGES * columns, 1.9 * len(records) + 0.2), layout="constrained")
     rows = figure.subplots(len(records), columns, squeeze=False)
     for record, panels in zip(records, rows, strict=True):
-        stages = np.unique(np.geomspace(1, len(record.cycles), columns).round().astype(int)) - 1
+        stages = np.unique(np.geomspace(1, record.tenths, columns).round().astype(int)) - 1
         for axes, k in zip(panels, stages, strict=False):
             _draw_map(axes, record, k)
             axes.set_title(f"cycle {record.cycles[k]}")
@@ -240,26 +258,30 @@ def _laid_out(figure: Figure) -> Figure:
 
 
 def _measures_figure(records: Sequence[PatternRecord]) -> Figure:
-    """Measures over the cycles; the published values as dashes."""
-    names = {"wavelength": "wavelength [D]", "roughness": "roughness [D]", "q2": "Q2", "q4": "Q4", "q6": "Q6"}
-    figure = Figure(figsize=(TWO_COLUMNS, 3.3), layout="constrained")
-    panels = figure.subplots(2, 3, sharex=True).ravel()
-    for axes, (name, label) in zip(panels, names.items(), strict=False):
+    """Measures over the cycles, of one phase; the published values as dashes."""
+    figure = Figure(figsize=(TWO_COLUMNS, 3.6), layout="constrained")
+    panels = figure.subplots(2, len(MEASURES) // 2, sharex=True).ravel()
+    for axes, (name, label) in zip(panels, MEASURES.items(), strict=True):
         for record in records:
-            values = [getattr(found, name) for found in record.measures()]
+            values = [getattr(found, name) for found in record.measures[: record.tenths]]
             color, published = COLORS[record.pattern], getattr(PUBLISHED[record.pattern], name, None)
             axes.plot(
-                record.cycles, values, color=color, marker=MARKERS[record.pattern], markersize=2.5, label=record.pattern
-            )
+                record.cycles[: record.tenths], values, color=color, marker=MARKERS[record.pattern], markersize=2.5,
+                label=record.pattern,
+            )  # fmt: skip
             if published is not None:
                 axes.axhline(published, color=color, linestyle=(0, (4, 3)), linewidth=0.8)
         axes.set_ylabel(label)
-        axes.set_ylim(0.0, 1.0 if name.startswith("q") else 1.1 * axes.get_ylim()[1])
-    for axes in panels[2:]:
+        if name.startswith(("q", "psi")):
+            axes.set_ylim(0.0, 1.0)
+        elif name != "skewness":
+            axes.set_ylim(0.0, 1.1 * axes.get_ylim()[1])
+    for axes in panels[len(MEASURES) // 2 :]:
         axes.set_xlabel("cycle")
-    panels[2].tick_params(labelbottom=True)
-    panels[-1].set_visible(False)
     lines, labels = panels[0].get_legend_handles_labels()
     published = Line2D([], [], color=BLACK, linestyle=(0, (4, 3)), linewidth=0.8, label="published panel")
-    figure.legend(handles=[*lines, published], labels=[*labels, "published panel"], loc="lower right")
+    figure.legend(
+        handles=[*lines, published], labels=[*labels, "published panel"], loc="outside lower center",
+        ncols=len(lines) + 1,
+    )  # fmt: skip
     return figure

@@ -135,6 +135,7 @@ def named_measures(found: Pattern) -> dict[str, float]:
     return {
         "wavelength [D]": found.wavelength, "share": found.share, "roughness [D]": found.roughness,
         "Q2": found.q2, "Q4": found.q4, "Q6": found.q6,
+        "skewness": found.skewness, "ψ4": found.psi4, "ψ6": found.psi6,
     }  # fmt: skip
 
 

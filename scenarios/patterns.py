@@ -5,6 +5,16 @@
 The map is the highest surface in each of 100 × 100 cells; cells without a grain take the median; then a Gaussian of two
 cells, the mean removed, and a Hann window. Stripes have Q2 > 0.8, squares Q4 > 0.75 and Q2 < 0.1, hexagons Q6 about
 0.48 and Q2 about 0.05 (measured on the panels of Bizon 1998). Only wavelengths side/1, side/2, … are told apart.
+
+A box of a few wavelengths holds few peaks, some of them held by the walls, and one row that is out of step turns the
+phases of all waves: Q_m of a lattice with defects says little. Two more measures look at what does not need order far
+and wide. Each peak's neighbors (Delaunay triangulation, the bonds that are much longer than most left out) give
+
+    ψ_m = mean of |Σ_j exp(i m θ_j)| / bonds     over the peaks that do not lie at a wall
+
+1 for m = 6 on a triangular lattice, 1 for m = 4 on a square one (Nelson and Halperin 1979). And the skewness of the
+heights tells peaks (> 0) from cells with walls (< 0): hexagons show one in one cycle and the other in the next, as what
+is up has another symmetry than what is down, while squares and stripes show the same in both, displaced.
 """
 
 from __future__ import annotations
@@ -12,7 +22,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import center_of_mass, gaussian_filter, label, maximum_filter
+from scipy.spatial import Delaunay, QhullError
+from scipy.stats import skew
 
 from solvers.solution import Floats
 
@@ -20,6 +32,18 @@ CELLS = 100
 """Cells along each side of the height map."""
 # Standard deviation of the Gaussian [cells]: a grain is about a cell wide.
 SMOOTHING = 2.0
+# Heights that differ by less than this share of the largest are the same but for rounding.
+FLAT = 1e-9
+# A peak is the highest cell in a square of this share of the wavelength, on a map smoothed by another share of it: a
+# grain that flies above all others is none.
+PEAK, PEAK_SMOOTHING = 0.6, 0.15
+# Closer to a wall than this share of the wavelength, a peak has neighbors on one side alone.
+WALL = 0.75
+# Bonds longer than this many times their lower quartile are none: the diagonals of squares are √2 times as long as the
+# sides.
+LONGEST_BOND = 1.3
+# Fewer peaks than this away from the walls say nothing.
+FEWEST_PEAKS = 3
 
 
 @dataclass(frozen=True)
@@ -35,6 +59,12 @@ class Pattern:
     q2: float
     q4: float
     q6: float
+    skewness: float
+    """Of the smoothed heights: > 0 for peaks, < 0 for cells with walls."""
+    psi4: float
+    """ψ4, order of four neighbors about the peaks (or the cells); NaN where there are too few."""
+    psi6: float
+    """ψ6, of six neighbors."""
 
 
 def height_map(place: Floats, side: float) -> Floats:
@@ -72,4 +102,35 @@ def measure_pattern(heights: Floats, side: float) -> Pattern:
     angle, weight = np.arctan2(ky[inside], kx[inside]), power[inside]
     q2, q4, q6 = (float(np.abs((weight * np.exp(1j * m * angle)).sum() / (weight.sum() or 1.0))) for m in (2, 4, 6))
     total = float(power.sum())
-    return Pattern(side / strongest, float(strength[strongest]) / (total or 1.0), float(smooth.std()), q2, q4, q6)
+    skewness = float(skew(smooth, axis=None)) if np.ptp(smooth) > FLAT * np.abs(smooth).max() else 0.0
+    psi4, psi6 = _bond_order(filled if skewness >= 0.0 else -filled, len(filled) / strongest)
+    share = float(strength[strongest]) / (total or 1.0)
+    return Pattern(side / strongest, share, float(smooth.std()), q2, q4, q6, skewness, psi4, psi6)
+
+
+def _bond_order(heights: Floats, wavelength: float) -> tuple[float, float]:
+    """ψ4 and ψ6 of the peaks of a map, with a wavelength in cells; NaN where there are too few."""
+    smooth = gaussian_filter(heights, PEAK_SMOOTHING * wavelength)
+    high = smooth > smooth.mean() + FLAT * np.abs(smooth).max()
+    # Cells of the same height side by side are one peak.
+    peak, count = label((smooth == maximum_filter(smooth, max(round(PEAK * wavelength), 1))) & high, np.ones((3, 3)))
+    place = np.array(center_of_mass(peak > 0, peak, np.arange(1, count + 1))).reshape(-1, 2)
+    inner = ((place > WALL * wavelength) & (place < len(heights) - WALL * wavelength)).all(axis=1)
+    if inner.sum() < FEWEST_PEAKS:
+        return np.nan, np.nan
+    try:
+        starts, neighbor = Delaunay(place).vertex_neighbor_vertices
+    except QhullError:
+        # All peaks on a line: there are no triangles.
+        return np.nan, np.nan
+    owner = np.repeat(np.arange(len(place)), np.diff(starts))
+    bond = (place[neighbor] - place[owner]).astype(np.float64)
+    length = np.hypot(bond[:, 0], bond[:, 1])
+    kept = length <= LONGEST_BOND * np.quantile(length, 0.25)
+    owner, angle = owner[kept], np.arctan2(bond[kept, 1], bond[kept, 0])
+    bonds = np.bincount(owner, minlength=len(place))
+    found = []
+    for m in (4, 6):
+        along, across = (np.bincount(owner, part(m * angle), len(place)) for part in (np.cos, np.sin))
+        found.append(float((np.hypot(along, across) / np.maximum(bonds, 1))[inner & (bonds > 0)].mean()))
+    return found[0], found[1]

@@ -56,6 +56,8 @@ def action_script(step: str) -> str:
         ({}, []),
         ({"SOLVER": "my law.py:MyLaw", "TIER": "smoke"}, ["--solver", "my law.py:MyLaw", "--tier", "smoke"]),
         ({"AGAINST": "$(touch x)"}, ["--against", "$(touch x)"]),
+        ({"FOREIGN": "true"}, ["--foreign"]),
+        ({"FOREIGN": "false"}, []),
     ],
 )
 def test_the_action_passes_its_inputs_on_as_they_are_and_ends_as_the_check_does(

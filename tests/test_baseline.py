@@ -683,6 +683,41 @@ def test_a_check_that_cannot_be_made_ends_with_exit_code_2(
     assert words in result.output
 
 
+@pytest.mark.parametrize(
+    ("key", "other", "words"),
+    [
+        ("machine", "vax", "architecture vax, not"),
+        ("os", "Plan9 4", "operating system Plan9, not"),
+        ("impactbench", "9.9.9", "version of impactbench 9.9.9, not"),
+    ],
+)
+def test_a_baseline_of_another_machine_or_version_is_refused_unless_asked_for(
+    key: str, other: str, words: str, gated: Mapping[str, Path], tmp_path: Path
+) -> None:
+    content = json.loads(gated["baseline"].read_text(encoding="utf-8"))
+    content["environment"][key] = other
+    mine = tmp_path / "b.json"
+    mine.write_text(json.dumps(content), encoding="utf-8")
+    result = call("check", *gate_arguments(gated, baseline=mine), "--no-measure")
+    assert result.exit_code == 2
+    assert words in result.output
+    assert "--foreign" in result.output
+    result = call("check", *gate_arguments(gated, baseline=mine), "--no-measure", "--foreign")
+    assert result.exit_code == 0
+    assert other in result.output
+
+
+def test_another_processor_and_release_are_no_other_kind_of_machine(gated: Mapping[str, Path], tmp_path: Path) -> None:
+    content = json.loads(gated["baseline"].read_text(encoding="utf-8"))
+    content["environment"]["cpu"] = "another one"
+    content["environment"]["os"] += ".1"
+    mine = tmp_path / "b.json"
+    mine.write_text(json.dumps(content), encoding="utf-8")
+    result = call("check", *gate_arguments(gated, baseline=mine), "--no-measure")
+    assert result.exit_code == 0
+    assert "another one" in result.output
+
+
 def test_accept_refuses_an_empty_reason_before_it_measures(gated: Mapping[str, Path], tmp_path: Path) -> None:
     before = gated["baseline"].read_bytes()
     for reason in (["--reason", " "], []):

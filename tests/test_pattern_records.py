@@ -60,6 +60,17 @@ def test_a_hundred_maps_fit_into_two_megabytes(tmp_path: Path) -> None:
     assert write_record(tmp_path / "squares.npz", rough).stat().st_size < LARGEST
 
 
+def test_a_last_map_of_the_other_phase_stands_beside_the_others_and_is_not_one_of_them(tmp_path: Path) -> None:
+    maps = record("squares", waves(2), waves(2), waves(1))
+    odd = PatternRecord(maps.run, np.array([10, 20, 21]), maps.heights)
+    again = read_record(write_record(tmp_path / "squares.npz", odd))
+    assert again.tenths == 2
+    assert standing_since(again) == 10
+    page = patterns_markdown([again])
+    assert "| squares | here | 20 | 25.0 |" in page
+    assert "| here, the other phase | 21 | 25.0 |" in page
+
+
 def test_a_pattern_stands_from_the_map_on_after_which_none_misses_it() -> None:
     stripes, squares = waves(1), waves(2)
     assert standing_since(record("squares", squares, stripes, squares, squares)) == 30

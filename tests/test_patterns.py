@@ -58,7 +58,71 @@ def test_noise_has_no_pattern() -> None:
 def test_a_flat_layer_is_not_divided_by_zero() -> None:
     found = measure_pattern(np.ones((CELLS, CELLS)), SIDE)
     assert found.roughness == 0.0
-    assert (found.q2, found.q4, found.q6) == (0.0, 0.0, 0.0)
+    assert (found.q2, found.q4, found.q6, found.skewness) == (0.0, 0.0, 0.0, 0.0)
+    assert np.isnan([found.psi4, found.psi6]).all()
+
+
+def peaks(place: Floats, width: float = 4.5) -> Floats:
+    """A map with a rounded peak at each of some places, shape (peaks, 2)."""
+    x, y = np.meshgrid(np.arange(CELLS) + 0.5, np.arange(CELLS) + 0.5, indexing="ij")
+    return np.asarray(sum(np.exp(-((x - a) ** 2 + (y - b) ** 2) / (2.0 * width**2)) for a, b in place))
+
+
+def lattice(bases: tuple[tuple[float, float], tuple[float, float]], turn: float, spacing: float) -> Floats:
+    """Places of a lattice all over the floor, turned about its middle."""
+    count = np.arange(-12, 13)
+    place = spacing * np.stack(np.meshgrid(count, count), axis=-1).reshape(-1, 2) @ np.array(bases)
+    across = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+    found = place @ across + 0.5 * CELLS
+    return np.asarray(found[((found > -5.0) & (found < CELLS + 5.0)).all(axis=1)])
+
+
+TRIANGULAR = ((1.0, 0.0), (0.5, np.sqrt(0.75)))
+SQUARE = ((1.0, 0.0), (0.0, 1.0))
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.2, 0.7])
+@pytest.mark.parametrize("high", [1.0, -1.0])
+def test_peaks_and_cells_of_a_triangular_lattice_have_six_neighbors(turn: float, high: float) -> None:
+    found = measure_pattern(high * peaks(lattice(TRIANGULAR, turn, 28.9)), SIDE)
+    assert found.psi6 > 0.9
+    assert found.psi4 < 0.2
+    assert found.skewness * high > 1.0
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.2, 0.7])
+def test_peaks_of_a_square_lattice_have_four_neighbors(turn: float) -> None:
+    found = measure_pattern(peaks(lattice(SQUARE, turn, 25.0)), SIDE)
+    # Of the five peaks away from the walls, some have a neighbor that a wall cuts.
+    assert found.psi4 > 0.65
+    assert found.psi6 < 0.25
+
+
+def test_peaks_at_random_have_no_order() -> None:
+    random = np.random.default_rng(0)
+    found = [measure_pattern(peaks(random.uniform(0.0, SIDE, (18, 2))), SIDE) for _ in range(40)]
+    assert np.nanmean([one.psi4 for one in found]) < 0.6
+    assert np.nanmean([one.psi6 for one in found]) < 0.6
+
+
+def test_defects_take_the_order_of_the_whole_and_leave_that_of_the_neighbors() -> None:
+    # Two halves of a lattice, one of them turned: order everywhere, but no common direction.
+    left, right = (lattice(TRIANGULAR, turn, 16.5) for turn in (0.0, np.pi / 6.0))
+    both = np.concatenate([left[left[:, 0] < 0.5 * SIDE], right[right[:, 0] >= 0.5 * SIDE + 6.0]])
+    found, whole = (measure_pattern(peaks(place, width=3.0), SIDE) for place in (both, left))
+    assert found.q6 < 0.6 * whole.q6
+    assert found.psi6 > 0.6 * whole.psi6
+    assert found.psi4 < 0.5 * found.psi6
+
+
+def test_waves_are_as_high_as_they_are_deep() -> None:
+    assert measure_pattern(waves(1, 5.0), SIDE).skewness == pytest.approx(0.0, abs=0.05)
+    assert measure_pattern(waves(2, 4.0), SIDE).skewness == pytest.approx(0.0, abs=0.05)
+
+
+def test_peaks_on_a_line_have_no_triangles() -> None:
+    found = measure_pattern(peaks(np.array([[20.0 * k, 50.0] for k in range(1, 5)])), SIDE)
+    assert np.isnan([found.psi4, found.psi6]).all()
 
 
 def test_empty_cells_take_the_median() -> None:
