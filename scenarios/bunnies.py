@@ -60,7 +60,7 @@ DROP = 0.5
 FARTHEST = 100.0
 GRAVITY = 9.81
 STAGES = ("the pawns are let go", "the pile is at rest")
-SOLVER = "qce-lcp:tolerance=1e-6,max_sweeps=1000"
+SOLVER = "qce-lcp:tolerance=1e-9,max_sweeps=1000"
 # The pile is at rest when this share of the energy of the fall is left in motion.
 AT_REST = 1e-6
 

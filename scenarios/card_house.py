@@ -47,7 +47,7 @@ IN_PLACE = 0.1
 # The cards are at rest when this share of the peak of their kinetic energy is left.
 AT_REST = 1e-6
 STAGES = ("the balls are let go", "the cards are at rest")
-SOLVER = "qce-lcp:tolerance=1e-6,max_sweeps=1000"
+SOLVER = "qce-lcp:tolerance=1e-9,max_sweeps=1000"
 
 
 def card_house(

@@ -84,7 +84,7 @@ PILLARS_FROM = 0.25
 # A card that tumbles down from the table moves by more than half its thickness in a step; contacts are seen two steps
 # ahead, so that it still passes through nothing.
 LARGEST_MOVE = 1.8
-SOLVER = "qce-lcp:tolerance=1e-6,max_sweeps=1000"
+SOLVER = "qce-lcp:tolerance=1e-9,max_sweeps=1000"
 
 
 def rube_goldberg(*, step: float = 0.001) -> MovingScene:

@@ -5,8 +5,8 @@
     v = v_start + M⁻¹ (Jᵀ λ + Dᵀ λ_f)
 
 `sweep` is projected Gauss-Seidel, alternating one sweep over the normals with one over the tangents (Zhang 2015,
-Eq. 20-21; Stewart 1996, Tonge 2012), followed by proximal Newton steps where sweeps with friction creep (see
-`proximal_newton`). `dissipate` solves the tangents alone, the normal impulses held (maximum
+Eq. 20-21; Stewart 1996, Tonge 2012), after proximal Newton steps where there is friction and the problem is small
+enough (see `projected_gauss_seidel`). `dissipate` solves the tangents alone, the normal impulses held (maximum
 dissipation). `project` solves the frictionless problem to rounding. This file is their contract; the work is done in
 `projected_gauss_seidel` and `cone_projection`.
 

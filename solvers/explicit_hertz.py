@@ -76,9 +76,10 @@ from solvers._jit import alone, parallel_kernel, prange
 from solvers.boxed_lcp import MAX_VISITS
 from solvers.compression import pair_duration
 from solvers.explicit_hertz_rows import Rows, rows
-from solvers.explicit_hertz_spheres import SHARED_CONTACTS, Spheres, spheres
+from solvers.explicit_hertz_spheres import Spheres, spheres
 from solvers.problem import ImpactProblem
 from solvers.solution import Floats, ImpactSolution, Status
+from solvers.sphere_chunks import SHARED_CONTACTS
 
 # Without gap memory, an approach slower than this part of the round's fastest waits for the next round, whose clock
 # is set by what is left: a contact lasts u^(-1/5) for η = 3/2, and the last ones would take most of the steps.
@@ -133,16 +134,15 @@ class ExplicitHertz:
             return _solution(problem, self.tolerance, problem.v_pre.copy(), run.u_min, run.P, None, run)
         # Out with the units: speeds by the fastest approach, W by its largest diagonal entry, k by its mean.
         w = float(problem.W_diagonal.max())
-        stiffness = _relative(problem.stiffness)
         threshold = MARGIN * self.tolerance * problem.speed / V
         elastic = bool(problem.restitution.min() == 1.0)
         if elastic and not problem.has_friction:
-            packed = spheres(problem, stiffness, exponent=self.exponent, V=V, w=w)
+            packed = spheres(problem, exponent=self.exponent, V=V, w=w)
             if packed is not None:
                 run = self._bounce(packed, threshold)
                 v, impulse = packed.in_problem_order(run.v, run.P, n=problem.n, V=V, w=w)
                 return _solution(problem, self.tolerance, v, V * run.u_min, impulse, None, run)
-        contacts = rows(problem, stiffness, V=V, w=w)
+        contacts = rows(problem, _relative(problem.stiffness), V=V, w=w)
         run = self._bounce(contacts, threshold) if elastic else self._bounce_and_settle(contacts, threshold)
         impulse = run.P * (V / w)
         friction_impulse = run.P_t * (V / w) if problem.has_friction else None
@@ -227,7 +227,7 @@ class _Run(NamedTuple):
 
 
 def _relative(stiffness: Floats) -> Floats:
-    """Stiffness over its geometric mean; exactly 1 where all are alike, without the logarithms."""
+    """Stiffness over its geometric mean; exactly 1 where all are alike."""
     if stiffness.min() == stiffness.max():
         return np.ones(stiffness.size)
     return stiffness / math.exp(float(np.log(stiffness).mean()))

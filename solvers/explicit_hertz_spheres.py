@@ -3,9 +3,8 @@
 The law and its step are those of `solvers.explicit_hertz`. While gaps are remembered, or much presses, a step sweeps
 over all contacts, lists those that press, and goes over the list once more for Rowlands' shift. Its length follows what
 is left: a contact of approach speed V lasts V^((1-η)/(1+η)), and speeds fall with the root of the energy of approach
-and of compression. Contacts are cut into chunks such that those of one parity share no body: the chunks of a parity run
-at the same time, and what a body sums up has one order whoever does it. Once gaps are forgotten and little presses,
-only contacts of bodies that were pushed are looked at, on one thread.
+and of compression. The chunks of a parity (see `sphere_chunks`) run at the same time. Once gaps are forgotten and
+little presses, only contacts of bodies that were pushed are looked at, on one thread.
 
 Stiffness is taken out: with rows k^(1/(η+1)) n in place of n, compressions and impulses by contact are those of k = 1,
 and the velocities of the bodies stay as they are. u, P and δ below are along these rows.
@@ -17,15 +16,12 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 
 from solvers._jit import alone, kernel, parallel_kernel, prange
 from solvers.problem import ImpactProblem
 from solvers.solution import Floats
-from solvers.sphere_rows import Indices, Ints, SphereRows
-
-# Unsigned as the indices of `sphere_rows`: no test for negative ones.
-Offsets = npt.NDArray[np.uint64]
+from solvers.sphere_chunks import FOUR, ONE, THREE, TWO, Indices, Offsets, SphereChunks
+from solvers.sphere_rows import Ints, SphereRows
 
 # From this many contacts on, packing spheres costs less than it saves: a third of the time of the general rows on a
 # pack of 364 contacts, a quarter on 3,030.
@@ -33,12 +29,8 @@ PACKED_CONTACTS = 300
 # Contacts a body from which on they are a layer. In a chain few contacts press at a time, and a packed step looks at
 # all: the general rows take a quarter of the time there.
 LAYERED = 2
-# From this many contacts on sharing the work out pays: below it threads wait for one another most of the time.
-SHARED_CONTACTS = 30_000
 # Packed spheres share one step: the longest may be this many times the shortest.
 PACKED_SPREAD = 4.0
-# Chunks of contacts that threads share out; the same for any number of threads.
-MOST_CHUNKS = 64
 # A pressing contact pushes two bodies, which take part in five others each: with fewer pressing than one in so many,
 # contacts of pushed bodies are fewer than half of all.
 SPARSE = 24
@@ -46,8 +38,6 @@ SPARSE = 24
 # sphere has twelve contacts at most, and moves at twice that speed beside a floor that moves. Beyond is no impact.
 RUNAWAY = 100.0
 NO_FRICTION = np.zeros(0)
-# Numba makes a signed index of an unsigned one and a plain number, and tests it for being negative at every access.
-ONE, TWO, THREE, FOUR, FIVE = np.uint64(1), np.uint64(2), np.uint64(3), np.uint64(4), np.uint64(5)
 # A gap that closes after a wait is zero to the rounding of that wait.
 CLOSED = 1e-14
 
@@ -57,16 +47,16 @@ class Spheres:
     """Elastic contacts of spheres without spin, in units of velocity V and inverse mass w; kernels see flat arrays."""
 
     rows: SphereRows
-    """The problem packed; its normals and bodies are not those of the kernels."""
+    """The problem packed."""
+
+    chunks: SphereChunks
+    """Its contacts in chunks; the normals are not those of the kernels."""
 
     v_pre: Floats
     """Velocity, then inverse mass of each body; one immovable body a chunk at the end; shape (4 (bodies + chunks),)."""
 
     normal: Floats
     """k^(1/(η+1)) n, shape (3m,)."""
-
-    body: Indices
-    """Where the rows of bodies a and b begin in velocities, shape (2m,)."""
 
     scale: Floats | None
     """k^(1/(η+1)), shape (m,), 1 at the softest contact; None where all are 1."""
@@ -76,17 +66,6 @@ class Spheres:
 
     inertia: float
     """Mass by which approach counts as energy: 1 over the mean rate."""
-
-    chunk: Offsets
-    """Where the chunks of contacts begin, shape (chunks + 1,)."""
-
-    bodies_of_chunk: int
-    """Bodies whose contacts a chunk takes."""
-
-    @property
-    def is_shared(self) -> bool:
-        """Whether threads share the work out."""
-        return self.rate.size >= SHARED_CONTACTS
 
     @property
     def friction_rows(self) -> int:
@@ -104,20 +83,15 @@ class Spheres:
         Returns:
             Relative velocities, shape (m,), a, b.
         """
-        run = _powers if self.is_shared else _powers_alone
-        u_end, power = run(self.chunk, self.normal, self.body, v_end, P, u)
+        run = _powers if self.chunks.is_shared else _powers_alone
+        u_end, power = run(self.chunks.begin, self.normal, self.chunks.body, v_end, P, u)
         return u_end, float(power[:, 0].sum()), float(power[:, 1].sum())
 
     def in_problem_order(self, v: Floats, P: Floats, *, n: int, V: float, w: float) -> tuple[Floats, Floats]:
         """Velocity, shape (n,), and impulse, shape (m,), in the problem's order and units."""
-        run = _in_problem_order if self.is_shared else _in_problem_order_alone
+        run = _in_problem_order if self.chunks.is_shared else _in_problem_order_alone
         P = P if self.scale is None else P * self.scale
         return run(v, P, self.rows.owner, self.rows.contact, n, V, V / w)
-
-    @cached_property
-    def contacts_of_body(self) -> tuple[Indices, Indices]:
-        """Where the contacts of each movable body begin, shape (bodies + 1,), and these contacts."""
-        return _contacts_of_body(self.body, self.rows.owner.size - 1)
 
     @cached_property
     def pushed(self) -> Floats:
@@ -138,19 +112,19 @@ class Spheres:
         compression = np.zeros(u.size)
         pressing = np.empty(u.size, np.uint32)
         dv = self.pushed
-        _clear(0, dv.size // 4, dv)
         steps, visits, finished = 0, u.size, False
         if gap_memory < 1.0:
-            run = _sweep if self.is_shared else _sweep_alone
+            _clear(0, dv.size // 4, dv)
+            run = _sweep if self.chunks.is_shared else _sweep_alone
             steps, visits, finished, n_pressing, h = run(
-                self.chunk, self.bodies_of_chunk, self.normal, self.body, self.inertia, exponent, h,
-                gap_memory, threshold, slowest, max_steps, max_visits, v, dv, P, compression, pressing,
+                self.chunks.begin, self.chunks.bodies_of_chunk, self.normal, self.chunks.body, self.inertia, exponent,
+                h, gap_memory, threshold, slowest, max_steps, max_visits, v, dv, P, compression, pressing,
             )  # fmt: skip
         else:
             n_pressing = _approaching(u, slowest, pressing)
         if not finished and n_pressing > 0:
             more, seen, finished = _follow(
-                *self.contacts_of_body, self.normal, self.body, exponent, h, slowest, max_steps - steps,
+                *self.chunks.contacts_of_body, self.normal, self.chunks.body, exponent, h, slowest, max_steps - steps,
                 max_visits - visits, n_pressing, v, dv, P, compression, pressing,
             )  # fmt: skip
             steps += more
@@ -158,98 +132,39 @@ class Spheres:
         return v, P, NO_FRICTION, 0.0, steps, visits, finished
 
 
-def spheres(problem: ImpactProblem, stiffness: Floats, *, exponent: float, V: float, w: float) -> Spheres | None:
+def spheres(problem: ImpactProblem, *, exponent: float, V: float, w: float) -> Spheres | None:
     """Pack an elastic problem in units of velocity V and inverse mass w; None where it has another form."""
     rows = problem.spheres_at_rest if problem.m >= PACKED_CONTACTS else None
     if rows is None or problem.m < LAYERED * (rows.owner.size - 1):
         return None
-    chunk, size = _chunks(rows.body, rows.owner.size - 1)
-    shared = problem.m >= SHARED_CONTACTS
-    in_packed_order, rates = (_in_packed_order, _rates) if shared else (_in_packed_order_alone, _rates_alone)
-    v_pre = in_packed_order(problem.v_pre, rows.owner, rows.V, chunk.size - 1, V, w)
-    body = _places(rows.body, rows.owner.size - 1, chunk)
-    softest = float(stiffness.min())
-    # A power costs as much as a sweep.
-    alike = softest == stiffness.max()
+    chunks = rows.chunks
+    pack = _in_packed_order if chunks.is_shared else _in_packed_order_alone
+    v_pre = pack(problem.v_pre, rows.owner, chunks.at_rest, 1.0 / V, 1.0 / w)
+    softest = float(problem.stiffness.min())
     # In units of the softest: no row is shorter than its normal, so that none approaches faster than its row says.
-    stiffness = stiffness if alike else stiffness[rows.contact] / softest
-    scale = None if alike else stiffness ** (1.0 / (exponent + 1.0))
-    rate, total = rates(chunk, rows.normal.reshape(-1), body, v_pre, stiffness)
+    if softest == problem.stiffness.max():
+        scale, rate = None, chunks.rates_of_equals / w
+    else:
+        stiffness = problem.stiffness[rows.contact] / softest
+        scale, rate = stiffness ** (1.0 / (exponent + 1.0)), chunks.rates(stiffness) / w
     if (rate.max() / rate.min()) ** (1.0 / (exponent + 1.0)) > PACKED_SPREAD:
         return None
-    normal = rows.normal.reshape(-1) if scale is None else (rows.normal * scale[:, None]).reshape(-1)
+    normal = chunks.normal if scale is None else (rows.normal * scale[:, None]).reshape(-1)
     # A kernel is compiled for one kind of array.
-    for array in (normal, body):
-        array.flags.writeable = False
-    return Spheres(rows, v_pre, normal, body, scale, rate, rate.size / float(total.sum()), chunk, size)
-
-
-def _chunks(body: Indices, bodies: int) -> tuple[Offsets, int]:
-    """Cut contacts, sorted by their lower-numbered body, so that a chunk reaches into the next one's bodies at most."""
-    size = max(int(_reach(body, bodies)), -(-bodies // MOST_CHUNKS))
-    return _cuts(body, size, -(-bodies // size)), size
-
-
-@kernel
-def _reach(body: Indices, bodies: int) -> np.uint32:
-    """How much higher one movable body of a contact is numbered than the other, at most; all where not sorted."""
-    reach = np.uint32(1)
-    last = np.uint32(0)
-    for i in range(body.shape[0]):
-        low = min(body[i, 0], body[i, 1])
-        high = max(body[i, 0], body[i, 1])
-        if low < last:
-            return np.uint32(bodies)
-        last = low
-        if high < bodies:
-            reach = max(reach, high - low)
-    return reach
-
-
-@kernel
-def _cuts(body: Indices, size: int, count: int) -> Offsets:
-    """Where the contacts of each `size` bodies begin, shape (count + 1,), by bisection."""
-    chunk = np.zeros(count + 1, np.uint64)
-    chunk[count] = body.shape[0]
-    for c in range(1, count):
-        low = chunk[c - 1]
-        high = chunk[count]
-        while low < high:
-            middle = (low + high) >> ONE
-            if min(body[middle, 0], body[middle, 1]) < c * size:
-                low = middle + ONE
-            else:
-                high = middle
-        chunk[c] = low
-    return chunk
-
-
-@kernel
-def _places(body: Indices, bodies: int, chunk: Offsets) -> Indices:
-    """Where the rows of bodies begin in velocities, shape (2m,); each chunk has a floor of its own.
-
-    Threads must not push the same floor.
-    """
-    place = np.empty(2 * body.shape[0], np.uint32)
-    for c in range(chunk.size - 1):
-        floor = np.uint32(4 * (bodies + c))
-        for i in range(chunk[c], chunk[c + 1]):
-            for side in range(2):
-                b = body[i, side]
-                place[2 * i + side] = floor if b == bodies else 4 * b
-    return place
+    normal.flags.writeable = False
+    return Spheres(rows, chunks, v_pre, normal, scale, rate, 1.0 / float(rate.mean()))
 
 
 @parallel_kernel
-def _in_packed_order(v: Floats, owner: Ints, at_rest: Floats, chunks: int, V: float, w: float) -> Floats:
-    """Velocities over V and inverse masses over w of packed bodies, then a floor for each chunk."""
-    bodies = owner.size - 1
-    width = v.size // bodies
-    packed = np.zeros(4 * (bodies + chunks))
+def _in_packed_order(v: Floats, owner: Ints, at_rest: Floats, slowness: float, mass: float) -> Floats:
+    """Velocities and inverse masses of packed bodies, times a slowness and a mass, laid out as the bodies at rest."""
+    bodies = np.uint64(owner.size - 1)
+    width = np.uint64(v.size) // bodies
+    packed = np.zeros(at_rest.size)
     for k in prange(bodies):
         for axis in range(width):
-            packed[4 * k + axis] = v[owner[k] * width + axis] / V
-        packed[4 * k + 3] = at_rest[k, 3] / w
+            packed[FOUR * k + axis] = v[np.uint64(owner[k]) * width + axis] * slowness
+        packed[FOUR * k + THREE] = at_rest[FOUR * k + THREE] * mass
     return packed
 
 
@@ -261,37 +176,19 @@ def _in_problem_order(
     v: Floats, P: Floats, owner: Ints, contact: Ints, n: int, speed: float, momentum: float
 ) -> tuple[Floats, Floats]:
     """Velocities times a speed, and impulses times a momentum, as the problem orders them."""
-    bodies = owner.size - 1
-    width = n // bodies
+    bodies = np.uint64(owner.size - 1)
+    width = np.uint64(n) // bodies
     velocity = np.empty(n)
     for k in prange(bodies):
         for axis in range(width):
-            velocity[owner[k] * width + axis] = speed * v[4 * k + axis]
+            velocity[np.uint64(owner[k]) * width + axis] = speed * v[FOUR * k + axis]
     impulse = np.empty(P.size)
-    for i in prange(P.size):
-        impulse[contact[i]] = momentum * P[i]
+    for i in prange(np.uint64(P.size)):
+        impulse[np.uint64(contact[i])] = momentum * P[i]
     return velocity, impulse
 
 
 _in_problem_order_alone = alone(_in_problem_order)
-
-
-@kernel
-def _contacts_of_body(body: Indices, bodies: int) -> tuple[Indices, Indices]:
-    """Where the contacts of each body begin, shape (bodies + 1,), and these contacts; others have none."""
-    first = np.zeros(bodies + 2, np.uint32)
-    for b in body:
-        if b < 4 * bodies:
-            first[(b >> 2) + 2] += 1
-    for k in range(bodies):
-        first[k + 2] += first[k + 1]
-    contact = np.empty(first[bodies + 1], np.uint32)
-    for q in range(body.size):
-        k = body[q] >> 2
-        if k < bodies:
-            contact[first[k + 1]] = q >> 1
-            first[k + 1] += 1
-    return first[:-1], contact
 
 
 @kernel
@@ -332,68 +229,6 @@ def _powers_of_chunk(
         a += P[i] * u[i]
         b += P[i] * (u_end[i] - u[i])
     return a, b
-
-
-@parallel_kernel
-def _rates(
-    chunk: Offsets, normal: Floats, body: Indices, V: Floats, stiffness: Floats
-) -> tuple[Floats, Floats]:  # fmt: skip
-    """(W K W)_ii / W_ii by one tensor Σ k n nᵀ a body, between two bodies that meet once; and their sum by chunk."""
-    chunks = chunk.size - 1
-    tensor = np.zeros(2 * V.size)
-    for parity in range(2):
-        for half in prange((chunks + 1 - parity) // 2):
-            c = 2 * half + parity
-            _add_tensors(chunk[c], chunk[c + 1], normal, body, stiffness, tensor)
-    rate = np.empty(stiffness.size)
-    total = np.empty(chunks)
-    for c in prange(chunks):
-        total[c] = _rates_of_chunk(chunk[c], chunk[c + 1], normal, body, stiffness, tensor, V, rate)
-    return rate, total
-
-
-_rates_alone = alone(_rates)
-
-
-@kernel
-def _add_tensors(
-    begin: np.uint64, end: np.uint64, normal: Floats, body: Indices, stiffness: Floats, tensor: Floats
-) -> None:
-    """Add k n nᵀ of a chunk's contacts to the tensors of their two bodies, eight places each."""
-    for i in range(begin, end):
-        n0, n1, n2, k = normal[THREE * i], normal[THREE * i + ONE], normal[THREE * i + TWO], stiffness[i]
-        for side in range(np.uint64(2)):
-            c = TWO * body[TWO * i + side]
-            tensor[c] += k * n0 * n0
-            tensor[c + ONE] += k * n1 * n1
-            tensor[c + TWO] += k * n2 * n2
-            tensor[c + THREE] += 2.0 * k * n0 * n1
-            tensor[c + FOUR] += 2.0 * k * n0 * n2
-            tensor[c + FIVE] += 2.0 * k * n1 * n2
-
-
-@kernel
-def _rates_of_chunk(
-    begin: np.uint64, end: np.uint64, normal: Floats, body: Indices, stiffness: Floats, tensor: Floats, V: Floats,
-    rate: Floats,
-) -> float:  # fmt: skip
-    """Fill in a chunk's rates and sum (see `_powers_of_chunk`)."""
-    total = 0.0
-    for i in range(begin, end):
-        n0, n1, n2 = normal[THREE * i], normal[THREE * i + ONE], normal[THREE * i + TWO]
-        square = n0 * n0 + n1 * n1 + n2 * n2
-        for_a, for_b = V[body[TWO * i] + THREE], V[body[TWO * i + ONE] + THREE]
-        square_of_row = 2.0 * for_a * for_b * stiffness[i] * square * square
-        for side in range(np.uint64(2)):
-            c = TWO * body[TWO * i + side]
-            w = V[body[TWO * i + side] + THREE]
-            square_of_row += w * w * (
-                tensor[c] * n0 * n0 + tensor[c + ONE] * n1 * n1 + tensor[c + TWO] * n2 * n2
-                + tensor[c + THREE] * n0 * n1 + tensor[c + FOUR] * n0 * n2 + tensor[c + FIVE] * n1 * n2
-            )  # fmt: skip
-        rate[i] = square_of_row / ((for_a + for_b) * square)
-        total += rate[i]
-    return total
 
 
 @kernel
@@ -475,7 +310,7 @@ def _shift(
 
 
 @kernel
-def _clear(begin: int, end: int, dv: Floats) -> None:
+def _clear(begin: int | np.uint64, end: int | np.uint64, dv: Floats) -> None:
     """Zero the velocities of bodies begin to end; their inverse masses stay."""
     for k in range(np.uint64(4 * begin), np.uint64(min(4 * end, dv.size)), np.uint64(4)):
         dv[k] = 0.0
@@ -610,30 +445,31 @@ def _follow(
     pushed = np.empty(first.size, np.uint32)
     seen = np.zeros(P.size, np.bool_)
     moved = np.zeros(first.size, np.bool_)
+    bodies = np.uint64(first.size - 1)
     visits = 0
     for step in range(max_steps):
         if visits >= max_visits:
             return step, visits, False
-        n_pushed = 0
-        for c in range(n_pressing):
+        n_pushed = np.uint64(0)
+        for c in range(np.uint64(n_pressing)):
             j = np.uint64(pressing[c])
-            for side in range(2):
-                k = body[TWO * j + np.uint64(side)] >> 2
-                if k + 1 < first.size and not moved[k]:
+            for side in range(np.uint64(2)):
+                k = np.uint64(body[TWO * j + side]) >> TWO
+                if k < bodies and not moved[k]:
                     moved[k] = True
                     pushed[n_pushed] = k
-                    n_pushed += 1
-        n_watched = 0
+                    n_pushed += ONE
+        n_watched = np.uint64(0)
         for c in range(n_pushed):
-            k = pushed[c]
+            k = np.uint64(pushed[c])
             moved[k] = False
-            _clear(k, k + 1, dv)
-            for q in range(first[k], first[k + 1]):
-                i = contact[q]
+            _clear(k, k + ONE, dv)
+            for q in range(np.uint64(first[k]), np.uint64(first[k + ONE])):
+                i = np.uint64(contact[q])
                 if not seen[i]:
                     seen[i] = True
                     watched[n_watched] = i
-                    n_watched += 1
+                    n_watched += ONE
         n_pressing = 0
         for c in range(n_watched):
             j = np.uint64(watched[c])
@@ -645,10 +481,10 @@ def _follow(
                 pressing[n_pressing] = j
                 n_pressing += 1
                 _push(normal, body, j, h * _force(compression[j], exponent), dv)
-        visits += n_watched + n_pressing
+        visits += int(n_watched) + n_pressing
         if n_pressing == 0:
             return step + 1, visits, True
-        for c in range(n_pressing):
+        for c in range(np.uint64(n_pressing)):
             j = np.uint64(pressing[c])
             kick = _shifted(normal, body, j, compression[j], h, exponent, dv)
             P[j] += kick

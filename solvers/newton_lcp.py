@@ -22,8 +22,8 @@ from solvers.solution import Floats, ImpactSolution, Status
 class NewtonLcp:
     """Simultaneous impacts as an LCP by projected Gauss-Seidel, with friction; one iteration is one sweep.
 
-    With friction, small problems on which sweeps creep go on in proximal Newton steps; their iterations count as
-    sweeps.
+    With friction, small problems begin with proximal Newton steps, as sweeps may creep; their iterations count as
+    sweeps, and sweeps take what they leave.
     """
 
     tolerance: float = 1e-11

@@ -7,9 +7,11 @@ v follows every step, so that a visit touches the velocities of one contact and 
 forms: packed where the problem is of spheres (`sphere_rows`: 32 bytes a contact, neighbors in space are neighbors in
 memory), CSR otherwise. Tangents are CSR over the same velocities, as spin may make their rows long.
 
-With friction sweeps may creep (see `proximal_newton`): what the first `FIRST` of them do not solve goes on in proximal
-steps where the problem is small enough, with a sweep after each, which measures it. An iteration of Newton's counts as
-a sweep. What ends early is cut to the share with which no kinetic energy is gained.
+With friction sweeps may creep (see `proximal_newton`), and where contacts are redundant friction leaves the velocity
+open: how a face's load is shared by its corners decides what each of them holds, and sweeps share it by the order of
+the contacts. Where the problem is small enough proximal steps come first, which do not depend on that order, each
+measured on the problem itself; an iteration of Newton's counts as a sweep. What they leave is left to sweeps. What ends
+early is cut to the share with which no kinetic energy is gained.
 
 Sources: Zhang 2015, Eq. 20-21; Stewart 1996; Tonge 2012.
 """
@@ -22,7 +24,7 @@ import scipy.sparse as sp
 
 from solvers._jit import kernel
 from solvers.problem import ImpactProblem, Matrix
-from solvers.proximal_newton import ITERATIONS, Elimination, eliminate, proximal_step
+from solvers.proximal_newton import ITERATIONS, eliminate, proximal_step
 from solvers.solution import Floats
 from solvers.sphere_rows import SphereRows, sphere_rows
 
@@ -34,15 +36,14 @@ Indices = npt.NDArray[np.uint32]
 REFRESH = 64
 # Packing a smaller problem takes longer than it saves.
 PACKED = 200
-# Sweeps before the first proximal step: most problems need no more.
-FIRST = 20
-# ε of the first proximal step, and its bounds: rounding below, hardly more than a sweep above.
-START, SMALLEST, LARGEST = 1e-4, 1e-7, 0.1
-# Sweeps and Newton's iterations from one start.
-NEWTON = 150
-# Shares of λ and λ_f of the first sweeps from which the steps start, one after the other until one ends: with friction
-# some problems have solutions that iterations turn away from, and others that they find.
-STARTS = ((1.0, 1.0), (0.0, 0.0), (1.0, 0.0), (10.0, 0.0), (0.5, 0.5), (100.0, 0.0))
+# ε of the first proximal step, and its bounds: rounding below, less than a sweep above.
+START, SMALLEST, LARGEST = 1e-3, 1e-7, 10.0
+# Newton's iterations at most: what they do not solve is left to sweeps.
+NEWTON = 1_000
+# Factor by which ε shrinks after a step that was solved, and grows after one that was not.
+CHANGE = 4.0
+# The least ε that is tried is twice the last one that failed; it is halved with each step that is solved.
+GUARD = 2.0
 # Packed velocities: three entries of a body, then its inverse mass.
 STRIDE = 4
 MASS = 3
@@ -73,21 +74,14 @@ def sweep(
         impulse, friction impulse [N s], velocity [m/s, rad/s], sweeps, row visits, natural map [m/s].
     """
     found, found_friction = impulse.copy(), friction_impulse.copy()
-    first = min(max_sweeps, FIRST) if problem.has_friction else max_sweeps
     rows = sphere_rows(problem) if problem.m >= PACKED else None
+    first = 0 if problem.has_friction else max_sweeps
     v, sweeps, visits, residual = _swept(problem, target, found, found_friction, rows, tolerance, first, max_visits)
-    elimination = eliminate(problem) if residual > tolerance and first < max_sweeps else None
-    if elimination is not None:
-        begin, begin_friction = found.copy(), found_friction.copy()
-        for share, friction_share in STARTS:
-            trial, trial_friction = share * begin, friction_share * begin_friction
-            trial_v, sweeps, visits, left = _proximal_steps(
-                problem, elimination, target, trial, trial_friction, sweeps, visits, tolerance, max_sweeps, max_visits
-            )
-            if left < residual:
-                found, found_friction, v, residual = trial, trial_friction, trial_v, left
-            if residual <= tolerance:
-                break
+    if residual > tolerance and problem.has_friction:
+        v, sweeps, visits, residual = _proximal_steps(
+            problem, target, found, found_friction, v, residual, visits,
+            tolerance=tolerance, max_steps=min(max_sweeps, NEWTON), max_visits=max_visits,
+        )  # fmt: skip
     if residual > tolerance and sweeps < max_sweeps and visits < max_visits:
         v, more, more_visits, residual = _swept(
             problem, target, found, found_friction, rows, tolerance, max_sweeps - sweeps, max_visits - visits
@@ -114,29 +108,33 @@ def _share_without_gain(problem: ImpactProblem, impulse: Floats, friction_impuls
 
 
 def _proximal_steps(
-    problem: ImpactProblem, elimination: Elimination, target: Floats, impulse: Floats, friction_impulse: Floats,
-    sweeps: int, visits: int, tolerance: float, max_sweeps: int, max_visits: int,
+    problem: ImpactProblem, target: Floats, impulse: Floats, friction_impulse: Floats, v: Floats, residual: float,
+    visits: int, *, tolerance: float, max_steps: int, max_visits: int,
 ) -> tuple[Floats, int, int, float]:  # fmt: skip
-    """Proximal steps from given impulses (changed in place), a sweep after each; returns as `_sweep`.
+    """Proximal steps from given impulses (changed in place), with their velocity and natural map; returns as `_sweep`.
 
-    A step that was solved may be followed by a longer one; one that was not is tried again with a shorter one, from
-    where it came to if that is nearer.
+    A step that was solved may be followed by a longer one, though not at once by one as long as failed; one that was
+    not is tried again with a shorter one, from where it came to if that is nearer.
     """
-    epsilon, v, residual = START, problem.v_pre, np.inf
-    last = min(max_sweeps, sweeps + NEWTON)
-    while residual > tolerance and sweeps + ITERATIONS < last and visits < max_visits:
-        trial, trial_friction, solved, steps = proximal_step(
+    elimination = eliminate(problem) if max_steps >= ITERATIONS else None
+    epsilon, least, steps = START, SMALLEST, 0
+    while (
+        elimination is not None and residual > tolerance and epsilon <= LARGEST
+        and steps + ITERATIONS <= max_steps and visits < max_visits
+    ):  # fmt: skip
+        trial, trial_friction, solved, more = proximal_step(
             problem, elimination, target, impulse, friction_impulse, epsilon=epsilon, tolerance=tolerance
         )
-        trial_v, more, more_visits, left = _swept(
-            problem, target, trial, trial_friction, None, tolerance, 1, max_visits
-        )
-        epsilon = max(0.1 * epsilon, SMALLEST) if solved else min(10.0 * epsilon, LARGEST)
+        trial_v, _, more_visits, left = _swept(problem, target, trial, trial_friction, None, tolerance, 0, max_visits)
         if solved or left < residual:
             impulse[:], friction_impulse[:], v, residual = trial, trial_friction, trial_v, left
-        sweeps += more + steps
-        visits += more_visits + steps * elimination.products
-    return v, sweeps, visits, residual
+        if solved:
+            epsilon, least = max(epsilon / CHANGE, least), max(least / GUARD, SMALLEST)
+        else:
+            epsilon, least = CHANGE * epsilon, GUARD * epsilon
+        steps += more
+        visits += more_visits + more * elimination.products
+    return v, steps, visits, residual
 
 
 def _swept(

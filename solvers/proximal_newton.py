@@ -44,8 +44,8 @@ LARGEST = 100_000
 MOST_BLOCKS = 500
 # Newton's iterations in a proximal step: either a few are enough, or they go round in circles.
 ITERATIONS = 14
-# Those that go all the way: the others go half of it, which leads out of most circles.
-FULL = 5
+# A step is given up when so many iterations in a row leave more than this share of the least violation before.
+PATIENCE, PROGRESS = 2, 0.9
 # A row of less than this share of the normal's entry of W moves nothing but by rounding.
 IMMOVABLE = 1e-20
 # A proximal step is solved to this share of the tolerance of the whole.
@@ -231,9 +231,14 @@ def _add_product(
         a = column[p] // WIDTH
         within = column[p] - a * WIDTH
         scaled = factor * value[p]
-        for q in range(other_start[other_row], other_start[other_row + 1]):
+        q = other_start[other_row]
+        while q < other_start[other_row + 1]:
+            # All columns of one block.
             b = other_column[q] // WIDTH
-            matrix[slot[a, b], within, other_column[q] - b * WIDTH] += scaled * other_value[q]
+            line = matrix[slot[a, b], within]
+            while q < other_start[other_row + 1] and other_column[q] - b * WIDTH < WIDTH:
+                line[other_column[q] - b * WIDTH] += scaled * other_value[q]
+                q += 1
 
 
 @kernel
@@ -478,14 +483,13 @@ def _proximal(
     sign = np.empty((m, 3))
     x = center.copy()
     bounded = np.empty((m, 3))
-    before = np.empty((m, 3))
     best = center.copy()
     least = np.inf
+    vain = 0
     for iteration in range(ITERATIONS):
         _velocity(JM_start, JM_column, JM, DM_start, DM_column, DM, v_pre, x, v)
         _gradient(J_start, J_column, J, D_start, D_column, D, diagonal, target, center, epsilon, x, v, u)
         _choose(diagonal, mu, epsilon, x, u, act, sign)
-        before[:] = x
         _newton(
             J_start, J_column, J, D_start, D_column, D, JM_start, JM_column, JM, DM_start, DM_column, DM,
             diagonal, mu, v_pre, target, center, act, sign, order, start, later, slot, matrix, epsilon,
@@ -499,13 +503,10 @@ def _proximal(
         _velocity(JM_start, JM_column, JM, DM_start, DM_column, DM, v_pre, bounded, v)
         _gradient(J_start, J_column, J, D_start, D_column, D, diagonal, target, center, epsilon, bounded, v, u)
         violation = _natural_map(diagonal, mu, epsilon, bounded, u)
+        vain = 0 if violation < PROGRESS * least else vain + 1
         if violation < least:
             least = violation
             best[:] = bounded
-        if violation <= tolerance:
-            return best, True, iteration + 1
-        if iteration >= FULL:
-            for i in range(m):
-                for k in range(3):
-                    x[i, k] = before[i, k] + 0.5 * (x[i, k] - before[i, k])
+        if violation <= tolerance or vain == PATIENCE:
+            return best, violation <= tolerance, iteration + 1
     return best, False, ITERATIONS

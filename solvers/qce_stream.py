@@ -38,7 +38,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from solvers._jit import alone, kernel, parallel_kernel, prange
+from solvers._jit import alone, kernel, parallel_kernel, prange, prefetch
 from solvers.problem import ImpactProblem
 from solvers.qce_heap import MAX_VISITS
 from solvers.solution import Floats
@@ -69,6 +69,11 @@ BLOCK = 2048
 # Sweeps over what a chunk woke before the next is begun. Without the ends to come two contacts can push each other's
 # end on for ever; with all of them, only a contact that never ends does.
 CHUNK_SWEEPS = 3
+# So many evaluations ahead a contact's own numbers are fetched; and so many, when they are there, its row of couplings.
+HEAD_AHEAD = np.uint64(16)
+ROW_AHEAD = np.uint64(8)
+# Couplings in a line of the cache: a row seldom takes more than two lines.
+LINE = np.uint32(8)
 # Where fewer than one contact in so many was active, only their neighborhood is searched for approaching contacts.
 SEARCH_ALL = 24
 # Rounding can make tied contacts wake each other for ever; no problem met here needed 100 sweeps beyond its contacts.
@@ -169,15 +174,28 @@ def _end_by_pieces(
 
 @kernel
 def _sweep(
-    begin: int, stop: int, due: Indices, load: Floats, start: Indices, neighbor: Indices, coupling: Floats,
-    end: Floats, awake: Flags, woken: Indices, count: int,
+    begin: int, stop: int, first: int, last: int, due: Indices, load: Floats, start: Indices, neighbor: Indices,
+    coupling: Floats, end: Floats, awake: Flags, woken: Indices, count: int,
 ) -> int:  # fmt: skip
-    """Evaluate contacts that are due, all of them in one strip (from `begin` to `stop`).
+    """Evaluate the contacts due at places `first` to `last`, all of them in one strip (from `begin` to `stop`).
 
     Those that were evaluated before and must be again become awake. Those of the strip are listed in `woken`, which
     holds `count` already; returns how many it holds then.
     """
-    for k in due:
+    size = np.uint64(due.size)
+    for place in range(np.uint64(first), np.uint64(last)):
+        # Contacts are due in another order than they lie in memory, which is beyond the caches near the core.
+        if place + HEAD_AHEAD < size:
+            j = due[place + HEAD_AHEAD]
+            prefetch(start, j + j)
+            prefetch(load, j + j)
+        if place + ROW_AHEAD < size:
+            j = due[place + ROW_AHEAD]
+            prefetch(end, j)
+            prefetch(neighbor, start[j, 0])
+            prefetch(coupling, start[j, 0])
+            prefetch(coupling, start[j, 0] + LINE)
+        k = due[place]
         before = end[k]
         row, row_stop = start[k, 0], start[k, 1]
         # Early neighbors are those evaluated already that end before this contact: as far as is known, or guessed.
@@ -243,34 +261,34 @@ def _sweep(
 
 
 @kernel
-def _sort(begin: int, stop: int, guess: Floats, key: Ints, first: Ints, order: Indices) -> None:
+def _sort(begin: int, stop: int, guess: Floats, key: Indices, first: Indices, order: Indices) -> None:
     """Counting sort of some active contacts by their likely end; equal keys keep their order."""
     bits = guess.view(np.int64)
     total = 0
     finite = 0
-    for k in range(begin, stop):
-        key[k] = bits[k] >> KEY_BITS
-        if guess[k] < NEVER:
-            total += key[k]
-            finite += 1
+    for k in range(np.uint64(begin), np.uint64(stop)):
+        ends = guess[k] < NEVER
+        total += (bits[k] >> KEY_BITS) * ends
+        finite += ends
     lowest = total // max(finite, 1) - KEYS // 2
     first[:] = 0
-    for k in range(begin, stop):
-        key[k] = min(max(key[k] - lowest, 0), KEYS - 1)
-        first[key[k] + 1] += 1
-    for c in range(KEYS):
-        first[c + 1] += first[c]
-    for k in range(begin, stop):
+    for k in range(np.uint64(begin), np.uint64(stop)):
+        c = np.uint32(min(max((bits[k] >> KEY_BITS) - lowest, 0), KEYS - 1))
+        key[k] = c
+        first[c + ONE] += ONE
+    for bucket in range(KEYS):
+        first[bucket + 1] += first[bucket]
+    for k in range(np.uint64(begin), np.uint64(stop)):
         place = first[key[k]]
         order[place] = k
-        first[key[k]] = place + 1
+        first[key[k]] = place + ONE
 
 
 @kernel
 def _settle(
     begin: int, stop: int, tile: int, tile_stop: int, load: Floats, guess: Floats, start: Indices,
     neighbor: Indices, coupling: Floats, end: Floats, awake: Flags, order: Indices, woken: Indices, again: Indices,
-    count: int, key: Ints, first_key: Ints,
+    count: int, key: Indices, first_key: Indices,
 ) -> tuple[int, int]:  # fmt: skip
     """Evaluate a tile of a strip, and what the tiles before it left over, the first `count` entries of `woken`.
 
@@ -285,14 +303,16 @@ def _settle(
     due = woken
     for chunk in range(0, size, CHUNK):
         count = _sweep(
-            begin, stop, order[chunk : min(chunk + CHUNK, size)], load, start, neighbor, coupling, end, awake,
+            begin, stop, chunk, min(chunk + CHUNK, size), order[:size], load, start, neighbor, coupling, end, awake,
             due, count,
         )  # fmt: skip
         for _ in range(CHUNK_SWEEPS):
             if count == 0:
                 break
             evaluations += count
-            count = _sweep(begin, stop, due[:count], load, start, neighbor, coupling, end, awake, again, 0)
+            count = _sweep(
+                begin, stop, 0, count, due[:count], load, start, neighbor, coupling, end, awake, again, 0
+            )  # fmt: skip
             due, again = again, due
     for p in range(count):
         woken[p] = due[p]
@@ -318,7 +338,9 @@ def _finish(
         if listed == 0:
             return evaluations, True
         evaluations += listed
-        listed = _sweep(0, load.shape[0], order[:listed], load, start, neighbor, coupling, end, awake, woken, 0)
+        listed = _sweep(
+            0, load.shape[0], 0, listed, order[:listed], load, start, neighbor, coupling, end, awake, woken, 0
+        )  # fmt: skip
         order, woken = woken, order
     return evaluations, False
 
@@ -327,7 +349,7 @@ def _finish(
 def _all_end(begin: int, stop: int, end: Floats) -> bool:
     """False where a contact never ends: it would leave work behind, and the outer iteration is not applied."""
     ended = 0
-    for k in range(begin, stop):
+    for k in range(np.uint64(begin), np.uint64(stop)):
         ended += end[k] < NEVER
     return ended == stop - begin
 
@@ -556,7 +578,7 @@ def _apply(
 def _settle_strip(
     begin: int, stop: int, row: np.uint64, near: Floats, pair: Indices, V: Floats, span: Indices, member: Indices,
     load: Floats, guess: Floats, start: Indices, neighbor: Indices, coupling: Floats, end: Floats,
-    awake: Flags, order: Indices, woken: Indices, again: Indices, key: Ints, first_key: Ints,
+    awake: Flags, order: Indices, woken: Indices, again: Indices, key: Indices, first_key: Indices,
 ) -> int:  # fmt: skip
     """Couple and evaluate the active contacts of a strip, tile by tile; returns the number of evaluations."""
     total = 0
@@ -601,7 +623,7 @@ def _solve_spheres(
     order = np.empty(m, np.uint32)
     woken = np.empty(m, np.uint32)
     again = np.empty(m, np.uint32)
-    key = np.empty(m, np.int32)
+    key = np.empty(m, np.uint32)
     neighbor = np.empty(0, np.uint32)
     coupling = np.empty(0)
     # Per strip: active contacts, couplings that they met when listed, where theirs begin, evaluations.
@@ -609,7 +631,7 @@ def _solve_spheres(
     met = np.zeros(strips, np.int64)
     place = np.zeros(strips + 1, np.uint64)
     evaluated = np.zeros(strips, np.int64)
-    first_key = np.empty((strips, KEYS + 1), np.int32)
+    first_key = np.empty((strips, KEYS + 1), np.uint32)
     # What only a search by neighborhood needs.
     contact_of = np.empty(0, np.uint32)
     seen = np.empty(0, np.int32)
@@ -817,7 +839,7 @@ def _solve_sparse(
     order = np.empty(m, np.uint32)
     woken = np.empty(m, np.uint32)
     again = np.empty(m, np.uint32)
-    first_key = np.empty(KEYS + 1, np.int32)
+    first_key = np.empty(KEYS + 1, np.uint32)
     neighbor = np.empty(8 * m + 8, np.uint32)
     coupling = np.empty(8 * m + 8)
     # All contacts are one strip.
@@ -846,7 +868,7 @@ def _solve_sparse(
             # `met` has served: it takes the sorting keys.
             evaluations, left = _settle(
                 0, size, tile, min(tile + TILE, size), load, guess, start, neighbor, coupling, end, awake,
-                order, woken, again, left, met, first_key,
+                order, woken, again, left, met.view(np.uint32), first_key,
             )  # fmt: skip
             visits += evaluations
         evaluations, settled = _finish(

@@ -9,13 +9,15 @@ from J's sparsity, whatever it was made from; a row on one body has the last, im
 Large problems are renumbered on the way: bodies in breadth-first order of the contact graph, contacts in the order in
 which that search meets them, so that neighbors in space are neighbors in memory.
 
-Packing and renumbering read the geometry alone: a problem keeps what comes of them (36 bytes a contact, and 36 a body),
-and every solve starts from a copy of the velocities.
+Packing and renumbering read the geometry alone: a problem keeps what comes of them (36 bytes a contact, and 36 a body;
+where chunks are asked for, as much as `sphere_chunks` says beside), and every solve starts from a copy of the
+velocities.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -23,6 +25,7 @@ import numpy.typing as npt
 
 from solvers._jit import kernel
 from solvers.solution import Floats
+from solvers.sphere_chunks import SphereChunks, chunks
 
 if TYPE_CHECKING:
     from solvers.problem import ImpactProblem, Matrix
@@ -60,6 +63,11 @@ class SphereRows:
     strip: Ints = field(default_factory=lambda: np.empty(0, np.int32))
     """Where strips of contacts begin, shape (strips + 1,), their last entry the end: those of even number share no
     movable body, nor do those of odd number. Empty where none are known."""
+
+    @cached_property
+    def chunks(self) -> SphereChunks:
+        """The contacts cut into chunks, with what the geometry says there; the velocities have no part in it."""
+        return chunks(self)
 
     def in_problem_order(self, per_contact: Floats) -> Floats:
         """Put an array over these contacts, shape (m,), in the problem's order."""

@@ -25,8 +25,8 @@ from solvers.qce_lcp import QceLcp
 
 # A resting step is converged within a few sweeps from the last one's impulses; a fall may end at the bound.
 LAWS: dict[str, Solver] = {
-    "qce-lcp": QceLcp(tolerance=1e-6, max_sweeps=1000),
-    "lcp-pgs": NewtonLcp(tolerance=1e-6, max_iterations=1000),
+    "qce-lcp": QceLcp(tolerance=1e-9, max_sweeps=1000),
+    "lcp-pgs": NewtonLcp(tolerance=1e-9, max_iterations=1000),
 }
 # What counts as standing, over the length of a card.
 STANDS = 0.01

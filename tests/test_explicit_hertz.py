@@ -11,7 +11,7 @@ from hypothesis import given, settings
 
 from scenarios.jammed import ball_ring
 from scenarios.packs import sphere_pack
-from solvers import ImpactProblem, Status, explicit_hertz_spheres
+from solvers import ImpactProblem, Status, explicit_hertz_spheres, sphere_chunks
 from solvers.explicit_hertz import ExplicitHertz
 from solvers.explicit_hertz_rows import rows
 from solvers.hertz import Hertz
@@ -313,7 +313,7 @@ def test_packed_spheres_of_unequal_stiffness_agree_with_the_general_path() -> No
     problem = problem.replace(stiffness=np.random.default_rng(4).uniform(0.3, 3.0, problem.m))
     law = ExplicitHertz(steps_per_contact=FINE_STEPS, gap_memory=0.0)
     packed, general = law.solve(problem), law.solve(with_an_idle_velocity(problem))
-    assert explicit_hertz_spheres.spheres(problem, problem.stiffness, exponent=1.5, V=1.0, w=1.0) is not None
+    assert explicit_hertz_spheres.spheres(problem, exponent=1.5, V=1.0, w=1.0) is not None
     assert packed.status is general.status is Status.CONVERGED
     assert abs(energy_change(problem, packed.v_post)) <= EXACT
     assert np.sqrt(np.mean((packed.v_post - general.v_post[:-1]) ** 2)) < UNEQUAL_APART
@@ -338,7 +338,7 @@ def test_the_step_of_packed_spheres_grows_as_speeds_fall() -> None:
 
 def test_a_step_that_is_too_long_ends_its_round_unfinished() -> None:
     problem = sphere_pack(spheres=300, start="hot").problem
-    contacts = explicit_hertz_spheres.spheres(problem, problem.stiffness, exponent=1.5, V=1.0, w=2.0)
+    contacts = explicit_hertz_spheres.spheres(problem, exponent=1.5, V=1.0, w=2.0)
     assert contacts is not None
     v = contacts.v_pre
     *_, steps, _, finished = contacts.integrate(
@@ -372,7 +372,7 @@ def test_settings_that_make_no_sense_are_refused(setting: dict[str, float]) -> N
 @pytest.mark.parametrize("start", ["kick", "hot"])
 def test_one_thread_alone_gives_the_bits_of_all_threads(start: str, monkeypatch: pytest.MonkeyPatch) -> None:
     problem = sphere_pack(spheres=300, start=start).problem
-    assert explicit_hertz_spheres.PACKED_CONTACTS < problem.m < explicit_hertz_spheres.SHARED_CONTACTS
+    assert explicit_hertz_spheres.PACKED_CONTACTS < problem.m < sphere_chunks.SHARED_CONTACTS
     one = ExplicitHertz().solve(problem)
-    monkeypatch.setattr(explicit_hertz_spheres, "SHARED_CONTACTS", 0)
+    monkeypatch.setattr(sphere_chunks, "SHARED_CONTACTS", 0)
     assert (ExplicitHertz().solve(problem).impulse == one.impulse).all()  # type: ignore[union-attr]

@@ -117,6 +117,15 @@ def test_a_ball_over_the_seam_of_a_union_has_one_contact() -> None:
         assert np.abs(contacts.normal[0]) == pytest.approx([0.0, 0.0, 1.0], abs=SINGLE_PRECISION)
 
 
+def test_bodies_of_parts_of_several_kinds_touch_once_where_their_seams_meet() -> None:
+    # The same end is a ball's and a capsule's in both: four pairs of parts, of which one is named the other way around.
+    # Their bounding boxes do not overlap: a gap is seen all the same.
+    pin = union([(capsule(0.1, 0.4), (0.0, 0.0, 0.0), IDENTITY), (ball(0.1), (0.0, 0.0, 0.4), IDENTITY)])
+    contacts = contacts_of([RigidBody("one", pin), RigidBody("other", pin, (0.201, 0.0, 0.0))], 0.01)
+    ends = np.sort(contacts.point[:, 2])
+    assert ends - ends.mean() == pytest.approx([-0.4, 0.4], abs=1e-6)
+
+
 def test_a_ball_in_a_groove_of_a_union_touches_both_flanks() -> None:
     plank = box((1.0, 0.5, 0.05))
     flanks = [(plank, (0.0, s * 0.5, 0.0), about((1.0, 0.0, 0.0), s * 0.5)) for s in (-1.0, 1.0)]
@@ -446,6 +455,10 @@ def test_bad_bodies_are_refused_by_name(bodies: list[RigidBody], rule: str) -> N
         (lambda: RigidSettings(step=0.0), "step"),
         (lambda: RigidSettings(step=np.nan), "step"),
         (lambda: RigidSettings(gravity=-1.0), "gravity"),
+        (lambda: RigidSettings(resting_speed=-1.0), "resting_speed"),
+        (lambda: RigidSettings(largest_move=0.0), "largest_move"),
+        (lambda: RigidSettings(slop=np.inf), "slop"),
+        (lambda: RigidSettings(correction=1.5), "correction"),
         (lambda: world([body()]).release("nobody"), "no body named nobody"),
         (lambda: world([floor(), body()]).release("floor"), "body floor"),
         (lambda: RigidWorld("test", [body()], RigidSettings(), Streamed()), "solver must be one of SOLVERS"),

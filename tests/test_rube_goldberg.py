@@ -31,8 +31,8 @@ from solvers.newton_lcp import NewtonLcp
 from solvers.qce_lcp import QceLcp
 
 LAWS: dict[str, Solver] = {
-    "qce-lcp": QceLcp(tolerance=1e-6, max_sweeps=1000),
-    "lcp-pgs": NewtonLcp(tolerance=1e-6, max_iterations=1000),
+    "qce-lcp": QceLcp(tolerance=1e-9, max_sweeps=1000),
+    "lcp-pgs": NewtonLcp(tolerance=1e-9, max_iterations=1000),
 }
 SPEED = 2.5
 

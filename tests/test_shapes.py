@@ -172,6 +172,8 @@ def test_an_open_file_is_named(tmp_path: Path) -> None:
         (lambda: capsule(-1.0, 1.0), "radius"),
         (lambda: hull(CORNERS * [1.0, 1.0, 0.0]), "volume"),
         (lambda: hull([[0.0, 0.0, 0.0]]), "shape"),
+        (lambda: hull([[0.0, 0.0, 0.0], [1.0]]), "points must be an array of real numbers"),
+        (lambda: union([(ball(1.0), "middle", IDENTITY)]), "position must be an array of real numbers"),
         (lambda: union([]), "at least one"),
         (lambda: union([(half_space(), (0, 0, 0), IDENTITY)]), "half space"),
         (lambda: union([(ball(1.0), (0, 0, np.nan), IDENTITY)]), "position"),

@@ -11,9 +11,10 @@ import pytest
 
 from scenarios.granular import falling_gas
 from scenarios.moving import MOVING
+from scenarios.world import grid, stepping
 from scenarios.world.checkpoint import FORMAT, CheckpointError, checkpoint, resume
 from scenarios.world.container import Container, Shake, Still, Vibration, box, drum
-from scenarios.world.grid import STRIPES, Contacts, find_contacts
+from scenarios.world.grid import STRIPES, Contacts, find_contacts, find_neighbors
 from scenarios.world.impact import OVERSHOOT, ByProblem, Constant, Impact, Resolver, SlowingRestitution, Streamed
 from scenarios.world.moving_scene import STREAMED
 from scenarios.world.spheres import Spheres, spheres
@@ -66,6 +67,18 @@ def as_set(contacts: Contacts, bodies: int) -> set[tuple[int, int]]:
     return {(a, b) if b < bodies else (-1, a) for a, b in pairs}
 
 
+def shared_bodies(contacts: Contacts, bodies: int) -> set[int]:
+    """Movable bodies that stripes of one parity share."""
+    shared: set[int] = set()
+    for parity in (0, 1):
+        seen: set[int] = set()
+        for k in range(parity, STRIPES, 2):
+            own = set(contacts.body[contacts.stripe[k] : contacts.stripe[k + 1]].ravel().tolist()) - {bodies}
+            shared |= own & seen
+            seen |= own
+    return shared
+
+
 @pytest.mark.kernels
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("container", [box(4.0, 3.0, Still()), drum(3.0), Container()])
@@ -89,12 +102,47 @@ def test_stripes_of_one_parity_share_no_movable_body(width: float) -> None:
     place[:, 3] *= 1.6
     contacts = find_contacts(place, box(width, width, Still()))
     assert contacts.m > len(place)
-    for parity in (0, 1):
-        seen: set[int] = set()
-        for k in range(parity, STRIPES, 2):
-            own = set(contacts.body[contacts.stripe[k] : contacts.stripe[k + 1]].ravel().tolist()) - {len(place)}
-            assert not own & seen
-            seen |= own
+    assert not shared_bodies(contacts, len(place))
+
+
+@pytest.mark.kernels
+@pytest.mark.parametrize("room", [grid.MOST_OF_A_STRAY, 0])
+@pytest.mark.parametrize("container", [box(14.0, 14.0, Still()), drum(14.0), Container()])
+def test_listed_neighbors_that_touch_after_a_move_are_those_found_anew(
+    container: Container, room: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(grid, "MOST_OF_A_STRAY", room)
+    random = np.random.default_rng(4)
+    place = np.column_stack([random.uniform(0.5, 13.5, (300, 2)), random.uniform(0.5, 3.0, 300), np.full(300, 0.5)])
+    reach, drift = 0.15, 0.4
+    near = find_neighbors(place, reach, container, drift=drift)
+    assert near.furthest > reach
+    step = random.normal(size=place[:, :3].shape)
+    step *= (random.uniform(0.0, reach, 300) / np.linalg.norm(step, axis=1))[:, None]
+    strays = np.sort(random.choice(300, 40, replace=False)).astype(np.uint32)
+    step[strays] *= 0.95 * min(near.furthest, 2.0) / np.linalg.norm(step[strays], axis=1)[:, None]
+    moved = place.copy()
+    moved[:, :3] += step
+    moved[:, 2] -= drift
+    touching, anew = near.touching(moved, container, strays=strays), find_contacts(moved, container)
+    assert touching.m == anew.m > 300
+    assert as_set(touching, 300) == as_set(anew, 300)
+    assert not shared_bodies(touching, 300)
+    assert (moved[:, 3] == 0.5).all()
+
+
+def test_a_world_finds_all_contacts_while_its_list_lasts(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stepping, "SPHERES_A_STRAY", 10)
+    world = shaken(Streamed())
+    lists = {id(world._neighbors): world._neighbors}
+    for _ in range(300):
+        impact = world.impact()
+        ahead = world.spheres.place.copy()
+        ahead[:, :3] += world.settings.step * impact.motion[:-1, :3]
+        assert as_set(impact.contacts, len(ahead)) == as_set(find_contacts(ahead, world.container), len(ahead))
+        lists[id(world._neighbors)] = world._neighbors
+        world.step()
+    assert len(lists) < 100
 
 
 @pytest.mark.parametrize("friction", [0.0, 0.5])
@@ -367,7 +415,7 @@ def test_contacts_without_memory_of_their_own_are_the_same() -> None:
     for _ in range(2):
         kept, fresh = find_contacts(place, walls, buffers=buffers), find_contacts(place, walls)
         assert kept.m == fresh.m > 100
-        for name in ("normal", "body", "gap", "stripe", "order"):
+        for name in ("normal", "body", "gap", "stripe"):
             assert np.array_equal(getattr(kept, name), getattr(fresh, name)), name
         place = place[::2].copy()
         place[:, 3] *= 1.3
@@ -376,7 +424,7 @@ def test_contacts_without_memory_of_their_own_are_the_same() -> None:
 @pytest.mark.kernels
 def test_spheres_in_one_place_are_refused() -> None:
     place = np.tile([[1.0, 1.0, 1.0, 0.5]], (60, 1))
-    with pytest.raises(ProblemError, match="more than 16 contacts a sphere"):
+    with pytest.raises(ProblemError, match="more than 24 pairs a sphere"):
         find_contacts(place, Container())
 
 

@@ -122,8 +122,11 @@ class Collider:
             found += [self._with_obstacle(k, centers, reach) for k in range(len(self._obstacles))]
         contacts = found[0] if len(found) == 1 else _joined(found)
         contacts = contacts.take(np.argsort(contacts.part, kind="stable"))
-        kept = _distinct(contacts.body, contacts.part, contacts.point, contacts.normal, contacts.gap,
-                         self._thickness, self._many)  # fmt: skip
+        pair = contacts.body.min(axis=1).astype(np.int64) << 32 | contacts.body.max(axis=1)
+        kept = _distinct(
+            contacts.body, contacts.part, contacts.point, contacts.normal, contacts.gap,
+            np.argsort(pair, kind="stable"), self._thickness, self._many,
+        )  # fmt: skip
         contacts = contacts if kept.all() else contacts.take(kept)
         return self._with_ends(contacts, position, orientation, reach)
 
@@ -155,8 +158,8 @@ class Collider:
         state = self._state
         pose = state.qpos.reshape(-1, 7)
         pose[:, :3], pose[:, 3:] = position, orientation
-        # The margins of the two geometries are added.
-        self._model.geom_margin[:] = 0.5 * reach
+        # The margins of the two geometries are added; those of the bodies tell which of these are looked at at all.
+        self._model.geom_margin[:] = self._model.body_margin[:] = 0.5 * reach
         self._kinematics(self._model, state)
         self._collision(self._model, state)
         if state.warning[self._full].number:
@@ -235,22 +238,24 @@ def _add(mujoco: Any, spec: Any, body: Any, name: str, part: Part, position: Flo
 
 @kernel
 def _distinct(
-    body: Ints, part: Keys, point: Floats, normal: Floats, gap: Floats, thickness: Floats, many: npt.NDArray[np.bool_]
-) -> npt.NDArray[np.bool_]:
-    """Which contacts to keep: of several that are one, the nearest."""
+    body: Ints, part: Keys, point: Floats, normal: Floats, gap: Floats, order: npt.NDArray[np.intp], thickness: Floats,
+    many: npt.NDArray[np.bool_],
+) -> npt.NDArray[np.bool_]:  # fmt: skip
+    """Which contacts to keep: of several that are one, the nearest; `order` sorts them by their two bodies."""
     m = gap.size
     kept = np.ones(m, np.bool_)
-    for i in range(m):
-        a = body[i, 0]
-        b = body[i, 1]
-        thin = min(thickness[a], thickness[b])
-        seams = many[a] or many[b]
-        for j in range(i + 1, m):
-            same = part[i] == part[j]
-            if not (same or seams):
-                # Sorted by parts: no other contact of these two.
+    for first in range(m):
+        i = order[first]
+        low = min(body[i, 0], body[i, 1])
+        high = max(body[i, 0], body[i, 1])
+        thin = min(thickness[low], thickness[high])
+        seams = many[low] or many[high]
+        for second in range(first + 1, m):
+            j = order[second]
+            if min(body[j, 0], body[j, 1]) != low or max(body[j, 0], body[j, 1]) != high:
                 break
-            if not kept[j] or body[j, 0] != a or body[j, 1] != b:
+            same = part[i] == part[j]
+            if not kept[j] or not (same or seams):
                 continue
             limit = (SAME_POINT if same else SEAM) * thin
             square = 0.0
@@ -258,6 +263,9 @@ def _distinct(
             for axis in range(3):
                 square += (point[i, axis] - point[j, axis]) ** 2
                 cosine += normal[i, axis] * normal[j, axis]
+            # MuJoCo sorts two parts by their kinds: of other parts of the same bodies the second may be the first.
+            if body[j, 0] != body[i, 0]:
+                cosine = -cosine
             if square < limit * limit and cosine > SEAM_COSINE:
                 if gap[j] < gap[i]:
                     kept[i] = False

@@ -19,7 +19,7 @@ import scipy.sparse as sp
 
 from scenarios.contacts import tangents_of
 from scenarios.world.grid import Contacts, Indices
-from scenarios.world.spheres import INVERSE_INERTIA, Ints
+from scenarios.world.spheres import INVERSE_INERTIA, PARTS, Ints
 from scenarios.world.warm_start import NO_IMPULSES, LastImpulses, labels_of
 from solvers import ImpactProblem, Solver, Status
 from solvers._jit import kernel, parallel_kernel, prange
@@ -96,10 +96,16 @@ class Impact:
         _relative_velocity(self.contacts.normal, self.contacts.body, self.contacts.stripe, self.motion, u)
         return u
 
+    @property
+    def speed(self) -> float:
+        """Largest |u_pre| [m/s]."""
+        return float(max(self.u_pre.max(initial=0.0), -self.u_pre.min(initial=0.0)))
+
     @cached_property
     def coefficient(self) -> Floats:
         """Coefficient of restitution of each contact, shape (m,)."""
-        return self.restitution.of(np.maximum(-self.u_pre, 0.0))
+        approach = np.negative(self.u_pre, out=self.buffers.array("approach", (self.contacts.m,)))
+        return self.restitution.of(np.maximum(approach, 0.0, out=approach))
 
     @cached_property
     def pair(self) -> Ints | None:
@@ -236,58 +242,41 @@ class Streamed:
     def resolve(self, impact: Impact) -> Outcome:
         """Solve one impact; `impact.motion` becomes the velocities after it."""
         contacts, buffers = impact.contacts, impact.buffers
-        speed = float(np.abs(impact.u_pre).max(initial=0.0))
-        restitution, pair = impact.coefficient, impact.pair
+        speed, restitution, pair = impact.speed, impact.coefficient, impact.pair
         overshoot, max_sweeps = (OVERSHOOT, self.max_sweeps) if pair is None else (1.0, 2 * self.max_sweeps)
         max_sweeps = max(max_sweeps, self.least_visits // max(contacts.m, 1))
-        start = impact.guess()
-        prediction = _NO_PREDICTION
+        start, target = impact.guess(), buffers.array("target", (contacts.m,))
+        target[:] = 0.0
+        iterations, status = 0, Status.CONVERGED
+        # QCE has no part in an inelastic impact.
         if restitution.any():
-            prediction = self._predict(impact, restitution, speed)
-            # Exact for one contact without friction.
-            start[:, 0] += 0.5 * (1.0 + restitution) * (restitution > 0.0) * prediction.impulse
+            iterations, status = self._predict(impact, start, target)
         result = sweep_spheres(
             SpinningRows(contacts.normal, contacts.body, impact.motion, contacts.stripe),
-            restitution * prediction.u, start, friction=impact.friction, inertia=INVERSE_INERTIA,
+            target, start, friction=impact.friction, inertia=INVERSE_INERTIA,
             tolerance=self.tolerance * speed, max_sweeps=max_sweeps, overshoot=overshoot, buffers=buffers,
         )  # fmt: skip
         residual = result.residual / (speed or 1.0)
-        status = prediction.status
         if status is Status.CONVERGED and residual > self.tolerance:
             status = Status.ITERATION_LIMIT
         impulses = NO_IMPULSES if pair is None else LastImpulses(pair, result.impulse)
-        return Outcome(status, prediction.iterations, result.sweeps, residual, result.normal_work, impulses)
+        return Outcome(status, iterations, result.sweeps, residual, result.normal_work, impulses)
 
-    def _predict(self, impact: Impact, restitution: Floats, speed: float) -> _Prediction:
-        """QCE's answer. It has no part in an inelastic impact."""
-        contacts, buffers = impact.contacts, impact.buffers
-        threshold = self.qce_tolerance * speed
-        V = buffers.array("V", (len(impact.motion), 4))
-        V[:] = impact.motion[:, :4]
+    def _predict(self, impact: Impact, start: Floats, target: Floats) -> tuple[int, Status]:
+        """Solve QCE, and form of its answer the first guess of λ and the velocity to reach; returns its iterations."""
+        contacts, restitution = impact.contacts, impact.coefficient
+        threshold = self.qce_tolerance * impact.speed
+        V = impact.buffers.array("V", (len(impact.motion), 4))
+        _without_spin(impact.motion, V)
         rows = SphereRows(contacts.normal, contacts.body, V, _NO_CONTACTS, strip=contacts.stripe)
         impulse, iterations, _, flag = solve_spheres(
             rows, threshold=threshold, defer=0.0, max_iterations=self.max_iterations
         )
-        u = buffers.array("u elastic", (contacts.m,))
-        _relative_velocity(contacts.normal, contacts.body, contacts.stripe, V, u)
-        status = Status.ITERATION_LIMIT if u.min(initial=0.0) < -threshold else Status.CONVERGED
-        return _Prediction(impulse, u, iterations, Status.STALLED if flag else status)
+        least = _aim(contacts.normal, contacts.body, contacts.stripe, V, restitution, impulse, start, target)
+        status = Status.ITERATION_LIMIT if least < -threshold else Status.CONVERGED
+        return iterations, Status.STALLED if flag else status
 
 
-@dataclass(frozen=True)
-class _Prediction:
-    """What QCE makes of an impact."""
-
-    impulse: Floats | float
-    """[N s], shape (m,)."""
-    u: Floats | float
-    """Normal relative velocity after it [m/s], shape (m,)."""
-    iterations: int
-    """Outer iterations."""
-    status: Status
-
-
-_NO_PREDICTION = _Prediction(0.0, 0.0, 0, Status.CONVERGED)
 _NO_CONTACTS = np.zeros(0, dtype=np.int32)
 
 
@@ -310,3 +299,44 @@ def _relative_velocity(normal: Floats, body: Indices, stripe: Ints, motion: Floa
     """Normal relative velocity of each contact."""
     for k in prange(stripe.size - 1):
         _relative_velocities(normal, body, motion, stripe[k], stripe[k + 1], u)
+
+
+@parallel_kernel
+def _without_spin(motion: Floats, V: Floats) -> None:
+    """Velocity and inverse mass of each body."""
+    bodies = motion.shape[0]
+    for part in prange(PARTS):
+        for b in range(bodies * part // PARTS, bodies * (part + 1) // PARTS):
+            for column in range(4):
+                V[b, column] = motion[b, column]
+
+
+@kernel
+def _aim_stripe(
+    normal: Floats, body: Indices, V: Floats, begin: int, end: int, restitution: Floats, impulse: Floats,
+    start: Floats, target: Floats,
+) -> float:  # fmt: skip
+    """As `_aim`, for some contacts."""
+    least = 0.0
+    for i in range(np.uint64(begin), np.uint64(end)):
+        a = body[i, 0]
+        b = body[i, 1]
+        u = normal[i, 0] * (V[b, 0] - V[a, 0]) + normal[i, 1] * (V[b, 1] - V[a, 1]) + normal[i, 2] * (V[b, 2] - V[a, 2])
+        least = min(least, u)
+        e = restitution[i]
+        target[i] = e * u
+        # (1 + e) / 2 is exact for one contact without friction; what lies has a guess of its own.
+        start[i, 0] += 0.5 * (1.0 + e) * impulse[i] if e > 0.0 else 0.0
+    return least
+
+
+@parallel_kernel
+def _aim(
+    normal: Floats, body: Indices, stripe: Ints, V: Floats, restitution: Floats, impulse: Floats, start: Floats,
+    target: Floats,
+) -> float:  # fmt: skip
+    """Fill the velocity to reach after QCE's answer V, and add to the guess of λ; returns the least velocity of V."""
+    least = np.zeros(stripe.size - 1)
+    for k in prange(stripe.size - 1):
+        least[k] = _aim_stripe(normal, body, V, stripe[k], stripe[k + 1], restitution, impulse, start, target)
+    return float(least.min())

@@ -70,8 +70,8 @@ class RigidImpact:
     def problem(self) -> ImpactProblem:
         """The impact for any solver.
 
-        All of it comes from kernels and from bodies that were checked: it is put together without checking it again,
-        which would take longer than the rest of a small step. A velocity that is not finite is found after the step.
+        All of it comes from kernels and from bodies that were checked: it is put together without checking it in every
+        step again. A velocity that is not finite is found after the step.
         """
         n, m = self.velocity.size, self.contacts.m
         inverse_mass = self.inverse_mass.ravel()

@@ -36,6 +36,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from scenarios.parameters import check_number, check_positive
 from scenarios.world.checkpoint import Arrays, CheckpointError
 from scenarios.world.collision import Collider, RigidContacts
 from scenarios.world.container import Container
@@ -75,7 +76,11 @@ RESTING_STEPS = 4.0
 
 @dataclass(frozen=True)
 class RigidSettings:
-    """What a scene is besides its bodies."""
+    """What a scene is besides its bodies.
+
+    Raises:
+        ProblemError: names the setting and the rule.
+    """
 
     step: float = 1e-3
     """Δt [s]."""
@@ -96,10 +101,13 @@ class RigidSettings:
     """Share of the overlap beyond the slop that a step takes away."""
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.step) and self.step > 0.0):
-            raise ProblemError(f"step must be finite and > 0, not {self.step:g}")
-        if not (np.isfinite(self.gravity) and self.gravity >= 0.0):
-            raise ProblemError(f"gravity must be finite and ≥ 0, not {self.gravity:g}")
+        check_positive("step", self.step)
+        check_number("gravity", self.gravity, low=0.0)
+        if self.resting_speed is not None:
+            check_number("resting_speed", self.resting_speed, low=0.0)
+        check_positive("largest_move", self.largest_move)
+        check_number("slop", self.slop, low=0.0)
+        check_number("correction", self.correction, low=0.0, high=1.0)
 
     @property
     def rest(self) -> float:

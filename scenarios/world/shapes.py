@@ -317,9 +317,9 @@ def given_pose(field: str, value: npt.ArrayLike) -> Floats:
     Raises:
         ProblemError: it has another shape or is not finite; the text begins with the field.
     """
-    vector = np.asarray(value, dtype=np.float64)
+    vector = _numbers(field, value)
     if vector.shape != (3,) or not np.isfinite(vector).all():
-        raise ProblemError(f"{field} must be three finite numbers, not {np.asarray(value).tolist()}")
+        raise ProblemError(f"{field} must be three finite numbers, not {vector.tolist()}")
     return vector
 
 
@@ -329,7 +329,7 @@ def unit_quaternion(value: npt.ArrayLike) -> Floats:
     Raises:
         ProblemError: it has another shape, is not finite, or zero.
     """
-    q = np.asarray(value, dtype=np.float64)
+    q = _numbers("orientation", value)
     if q.shape != (4,) or not np.isfinite(q).all() or not q.any():
         raise ProblemError(f"orientation must be a quaternion (w, x, y, z), finite and not zero, not {q.tolist()}")
     scaled: Floats = q / np.linalg.norm(q)
@@ -416,12 +416,20 @@ def _hull_of(points: Floats, field: str) -> Any:
 
 def _points(field: str, value: npt.ArrayLike) -> Floats:
     """Check points, shape (k, 3)."""
-    points = np.asarray(value, dtype=np.float64)
+    points = _numbers(field, value)
     if points.ndim != 2 or points.shape[1] != 3 or len(points) < 4:
         raise ProblemError(f"{field} must have shape (k, 3) with k ≥ 4, not {points.shape}")
     if not np.isfinite(points).all():
         raise ProblemError(f"{field} must be finite")
     return points
+
+
+def _numbers(field: str, value: npt.ArrayLike) -> Floats:
+    """Check that there are numbers, in rows of the same length."""
+    try:
+        return np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ProblemError(f"{field} must be an array of real numbers, not {value!r}") from None
 
 
 def _check_sizes(field: str, sizes: Sequence[float], *, count: int | None = None) -> None:

@@ -21,6 +21,10 @@ Ints = npt.NDArray[np.int32]
 INVERSE_INERTIA = 2.5
 """m r² over the moment of inertia of a solid sphere; an impulse at the surface changes s so much more than v."""
 
+PARTS = 16
+"""Parts of a loop over the spheres: enough for the threads of a desktop machine. A sum is one of sums of parts, so that
+it is the same on any number of threads."""
+
 
 @dataclass
 class Spheres:

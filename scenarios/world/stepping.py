@@ -24,17 +24,20 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from scenarios.world.checkpoint import Arrays, CheckpointError
 from scenarios.world.container import Container
-from scenarios.world.grid import Indices, find_contacts
+from scenarios.world.grid import NO_STRAYS, Indices, find_neighbors
 from scenarios.world.impact import Impact, Resolver, Restitution
-from scenarios.world.spheres import INVERSE_INERTIA, Ints, Spheres
+from scenarios.world.spheres import INVERSE_INERTIA, PARTS, Ints, Spheres
 from scenarios.world.warm_start import NO_IMPULSES, LastImpulses
 from solvers import ImpactProblem, ProblemError, Status
 from solvers._jit import kernel, parallel_kernel, prange
 from solvers.buffers import Buffers
 from solvers.solution import Floats
+
+Counts = npt.NDArray[np.int64]
 
 # A scene may start with spheres that overlap by this share of the smallest radius: rounding, or a layer made before.
 LARGEST_OVERLAP = 0.02
@@ -42,13 +45,17 @@ LARGEST_OVERLAP = 0.02
 CORRECTION_SWEEPS = 3
 # Scenes of so many spheres are kept in an order in which neighbors in space are neighbors in memory.
 RENUMBERED = 8_000
-# Steps between two renumberings: a sphere moves about a diameter meanwhile.
+# Steps between two renumberings, at least: a sphere moves about a diameter meanwhile.
 RENUMBER_EVERY = 32
-# Parts of a loop over the spheres: enough for the threads of a desktop machine. A sum is one of sums of parts, so that
-# it is the same on any number of threads.
-PARTS = 16
-# Entries of `_sums`.
-KINETIC, MOMENTUM, MASS, FASTEST = range(4)
+# A sphere may go so far, over the smallest radius, before it is a stray, and one sphere in so many may be one; then the
+# neighbors are listed anew. A longer reach makes more pairs, and strays take more time each.
+REACH = 0.3
+SPHERES_A_STRAY = 256
+# How far all spheres together may go along z before that, over the smallest radius: so far off, walls are listed.
+DRIFT = 2.0
+# Sums over the spheres: kinetic energy [J], vertical momentum [N s], mass [kg], largest speed squared [m²/s²] (NaN
+# where any is), Σ m z [kg m], and the correction's share of it.
+KINETIC, MOMENTUM, MASS, FASTEST, HEIGHT, LIFTED, SUMS = range(7)
 
 
 @dataclass(frozen=True)
@@ -144,8 +151,10 @@ class World:
         self._buffers = Buffers()
         self._spare_motion, self._spare_place = np.empty_like(self.spheres.motion), np.empty_like(self.spheres.place)
         self._smallest = float(self.spheres.radius.min())
-        self._sums = _sums(self.spheres.motion)
-        contacts = find_contacts(self.spheres.place, self.container)
+        self._sums = self._sums_now()
+        self._numbered = 0
+        self._list(self.spheres.place.copy(), self._sums[HEIGHT] / self._sums[MASS])
+        contacts = self._neighbors.touching(self.spheres.place, self.container)
         deepest = int(np.argmin(contacts.gap)) if contacts.m else 0
         if contacts.m and contacts.gap[deepest] < -LARGEST_OVERLAP * self._smallest:
             raise ProblemError(
@@ -173,6 +182,8 @@ class World:
         spheres = self.spheres
         return {
             "steps": np.array(self.steps), "place": spheres.place, "motion": spheres.motion, "label": spheres.label,
+            "numbered": np.array(self._numbered), "listed height": np.array(self._listed_height),
+            "listed place": self._neighbors.place,
             **self._last.state(),
         }  # fmt: skip
 
@@ -192,7 +203,9 @@ class World:
         self._last = LastImpulses(state["pair"], state["impulse"])
         for name in ("place", "motion", "label"):
             getattr(self.spheres, name)[:] = state[name]
-        self._sums = _sums(self.spheres.motion)
+        self._sums = self._sums_now()
+        self._numbered = int(state["numbered"])
+        self._list(state["listed place"], float(state["listed height"]))
 
     def problem(self) -> ImpactProblem:
         """The impact that the next step will solve, as any solver takes it."""
@@ -209,22 +222,20 @@ class World:
         contacts, motion = impact.contacts, impact.motion
         u_pre = impact.u_pre
         outcome = self.resolver.resolve(impact)
-        before, after = self._sums, _sums(motion)
-        self._check_move(float(np.sqrt(after[FASTEST])))
         shift = self._buffers.array("shift", (len(motion), 3))
         overlap = _push_apart(
             contacts.normal, contacts.body, contacts.gap, contacts.stripe, u_pre, motion,
             self.settings.step, self.settings.slop * self._smallest, self.settings.correction,
             self._buffers.array("deep", (contacts.m,), np.uint32), self._buffers.array("wanted", (contacts.m,)), shift,
         )  # fmt: skip
-        height, lifted = _move(self.spheres.place, motion, self.settings.step, shift)
+        before, after = self._sums, _move(self.spheres.place, motion, self.settings.step, shift, self._spare_place)
+        self._check_move(float(np.sqrt(after[FASTEST])))
         self._spare_motion, self.spheres.motion = self.spheres.motion, motion
+        self._spare_place, self.spheres.place = self.spheres.place, self._spare_place
         self._last = outcome.impulses
         self._sums = after
         self.steps += 1
-        if self.spheres.count >= RENUMBERED and self.steps % RENUMBER_EVERY == 0:
-            self.spheres.renumber(contacts.order)
-        ledger = self._ledger(before, after, height, lifted, outcome.normal_work)
+        ledger = self._ledger(before, after, outcome.normal_work)
         return StepReport(
             self.steps,
             self.time,
@@ -245,18 +256,62 @@ class World:
         return motion.speed(now + self.settings.step) - motion.speed(now)
 
     def impact(self) -> Impact:
-        """The next step's impact: velocities after gravity and shaking, contacts where these would lead."""
+        """The next step's impact: velocities after gravity and shaking, contacts where these would lead.
+
+        It may renumber the spheres of a large scene, as the step itself would.
+        """
         return self._impact(np.empty_like(self.spheres.motion), np.empty_like(self.spheres.place), Buffers())
 
     def _impact(self, motion: Floats, ahead: Floats, buffers: Buffers) -> Impact:
         """The next step's impact, in memory that is there."""
-        settings = self.settings
+        settings, spheres = self.settings, self.spheres
         fall = settings.gravity * settings.step + self._kick()
-        _fall(self.spheres.place, self.spheres.motion, fall, settings.step, motion, ahead)
-        contacts = find_contacts(ahead, self.container, buffers=buffers)
-        return Impact(
-            contacts, motion, settings.restitution, settings.friction, self.spheres.label, self._last, buffers
-        )
+        rise = self._sums[MOMENTUM] / self._sums[MASS] - fall
+        height = self._sums[HEIGHT] / self._sums[MASS] + settings.step * rise
+        strays = self._fall(fall, height, motion, ahead)
+        if strays is None:
+            if spheres.count >= RENUMBERED and self.steps >= self._numbered + RENUMBER_EVERY:
+                spheres.renumber(self._neighbors.grid.order)
+                self._numbered, self._sums = self.steps, self._sums_now()
+                self._fall(fall, height, motion, ahead)
+            self._list(ahead.copy(), height)
+            strays = NO_STRAYS
+        contacts = self._neighbors.touching(ahead, self.container, strays=strays, buffers=buffers)
+        return Impact(contacts, motion, settings.restitution, settings.friction, spheres.label, self._last, buffers)
+
+    def _fall(self, fall: float, height: float, motion: Floats, ahead: Floats) -> Indices | None:
+        """Fill velocities after gravity and shaking, and the places ahead.
+
+        Args:
+            fall: velocity that all spheres lose [m/s].
+            height: mean of z, weighted with the masses, ahead [m].
+            motion: as `Spheres.motion`, shape (bodies + 1, 8).
+            ahead: as `Spheres.place`, shape (bodies, 4).
+
+        Returns:
+            Spheres out of the neighbors' reach, in ascending order; None where the neighbors must be listed anew.
+        """
+        near, count = self._neighbors, self.spheres.count
+        drift = height - self._listed_height
+        stray = self._buffers.array("stray", (count,), np.uint32)
+        gone, furthest = _fall(
+            self.spheres.place, self.spheres.motion, fall, self.settings.step, near.place, near.reach, drift, motion,
+            ahead, stray,
+        )  # fmt: skip
+        if abs(drift) > near.drift or gone.sum() * SPHERES_A_STRAY > count or furthest > near.furthest:
+            return None
+        return np.concatenate([stray[count * k // PARTS :][:n] for k, n in enumerate(gone)])
+
+    def _list(self, place: Floats, height: float) -> None:
+        """List the neighbors; `height` is the mean of z, weighted with the masses [m]."""
+        reach, drift = REACH * self._smallest, DRIFT * self._smallest
+        self._neighbors = find_neighbors(place, reach, self.container, drift=drift, buffers=self._buffers)
+        self._listed_height = height
+
+    def _sums_now(self) -> Floats:
+        """Sums over the spheres, as `_move` returns them."""
+        place, motion = self.spheres.place, self.spheres.motion
+        return _move(place, motion, 0.0, np.zeros((len(motion), 3)), self._spare_place)
 
     def _check_move(self, fastest: float) -> None:
         move = fastest * self.settings.step
@@ -269,8 +324,8 @@ class World:
                 "is needed"
             )
 
-    def _ledger(self, before: Floats, after: Floats, height: float, lifted: float, normal_work: float) -> Ledger:
-        """Where the energy of the last step went; `height` is Σ m z after it, `lifted` the correction's share of it."""
+    def _ledger(self, before: Floats, after: Floats, normal_work: float) -> Ledger:
+        """Where the energy of the last step went."""
         g, step = self.settings.gravity, self.settings.step
         # The step is counted already.
         motion = self.container.motion
@@ -283,10 +338,10 @@ class World:
         impact = change if self.settings.friction == 0.0 or np.isnan(normal_work) else normal_work
         return Ledger(
             float(after[KINETIC]),
-            g * height,
+            float(g * after[HEIGHT]),
             float(impact),
             float(change - impact),
-            g * lifted,
+            float(g * after[LIFTED]),
             float(shaking),
             float(falling + g * step * after[MOMENTUM]),
         )
@@ -298,18 +353,42 @@ def _pair(body: Indices, spheres: int) -> str:
 
 
 @parallel_kernel
-def _fall(place: Floats, motion: Floats, fall: float, step: float, after: Floats, ahead: Floats) -> None:
-    """Velocities after gravity and shaking, and the places to which they lead."""
+def _fall(
+    place: Floats, motion: Floats, fall: float, step: float, listed: Floats, reach: float, drift: float,
+    after: Floats, ahead: Floats, stray: Indices,
+) -> tuple[Counts, float]:  # fmt: skip
+    """Velocities after gravity and shaking, and the places to which they lead.
+
+    Lists the spheres that are out of reach there, those of each part from its first place on; returns how many there
+    are in each part, and how far the furthest is gone, inf where a place is NaN.
+    """
     bodies = place.shape[0]
+    gone = np.zeros(PARTS, np.int64)
+    furthest = np.zeros(PARTS)
     for part in prange(PARTS):
-        for b in range(bodies * part // PARTS, bodies * (part + 1) // PARTS):
+        begin = bodies * part // PARTS
+        size = 0
+        longest = 0.0
+        for b in range(begin, bodies * (part + 1) // PARTS):
             for column in range(8):
                 after[b, column] = motion[b, column]
             after[b, 2] -= fall
             for axis in range(3):
                 ahead[b, axis] = place[b, axis] + step * after[b, axis]
             ahead[b, 3] = place[b, 3]
+            dx = ahead[b, 0] - listed[b, 0]
+            dy = ahead[b, 1] - listed[b, 1]
+            dz = ahead[b, 2] - listed[b, 2] - drift
+            square = dx * dx + dy * dy + dz * dz
+            # Not "beyond the reach", which NaN never is.
+            if not square <= reach * reach:
+                stray[begin + size] = b
+                size += 1
+                longest = max(longest, square if square >= 0.0 else np.inf)
+        gone[part] = size
+        furthest[part] = np.sqrt(longest)
     after[bodies] = motion[bodies]
+    return gone, furthest.max()
 
 
 @kernel
@@ -392,41 +471,32 @@ def _push_stripe(
 
 
 @parallel_kernel
-def _move(place: Floats, motion: Floats, step: float, shift: Floats) -> tuple[float, float]:
-    """New places; returns Σ m z of them, and Σ m Δz of the shift alone."""
+def _move(place: Floats, motion: Floats, step: float, shift: Floats, moved: Floats) -> Floats:
+    """New places, and the sums over the spheres there, shape (SUMS,)."""
     bodies = place.shape[0]
-    height = np.zeros(PARTS)
-    lifted = np.zeros(PARTS)
+    sums = np.zeros((PARTS, SUMS))
     for part in prange(PARTS):
-        for b in range(bodies * part // PARTS, bodies * (part + 1) // PARTS):
-            mass = 1.0 / motion[b, 3]
-            for axis in range(3):
-                place[b, axis] += step * motion[b, axis] + shift[b, axis]
-            height[part] += mass * place[b, 2]
-            lifted[part] += mass * shift[b, 2]
-    return height.sum(), lifted.sum()
-
-
-@parallel_kernel
-def _sums(motion: Floats) -> Floats:
-    """Kinetic energy, vertical momentum, mass, largest speed squared (NaN where any is)."""
-    bodies = motion.shape[0] - 1
-    sums = np.zeros((PARTS, 4))
-    for part in prange(PARTS):
-        kinetic = momentum = total = fastest = 0.0
+        kinetic = momentum = total = fastest = height = lifted = 0.0
         for b in range(bodies * part // PARTS, bodies * (part + 1) // PARTS):
             mass = 1.0 / motion[b, 3]
             square = motion[b, 0] ** 2 + motion[b, 1] ** 2 + motion[b, 2] ** 2
             spin = motion[b, 4] ** 2 + motion[b, 5] ** 2 + motion[b, 6] ** 2
+            for axis in range(3):
+                moved[b, axis] = place[b, axis] + step * motion[b, axis] + shift[b, axis]
+            moved[b, 3] = place[b, 3]
             kinetic += 0.5 * mass * (square + spin / INVERSE_INERTIA)
             momentum += mass * motion[b, 2]
             total += mass
             fastest = max(fastest, square)
+            height += mass * moved[b, 2]
+            lifted += mass * shift[b, 2]
         sums[part, KINETIC] = kinetic
         sums[part, MOMENTUM] = momentum
         sums[part, MASS] = total
         # NaN is lost in a comparison, not in a sum.
         sums[part, FASTEST] = fastest + 0.0 * kinetic
+        sums[part, HEIGHT] = height
+        sums[part, LIFTED] = lifted
     found: Floats = sums.sum(axis=0)
     found[FASTEST] = sums[:, FASTEST].max()
     return found

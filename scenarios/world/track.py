@@ -183,8 +183,9 @@ def straight(start: Sequence[float], end: Sequence[float], *, spacing: float) ->
     Args:
         start: first point [m].
         end: last point [m].
-        spacing: largest distance of two points [m].
+        spacing: largest distance of two points, > 0 [m].
     """
+    check_positive("spacing", spacing)
     first, last = np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64)
     intervals = max(int(np.ceil(np.linalg.norm(last - first) / spacing)), 3)
     return first + np.linspace(0.0, 1.0, intervals + 1)[:, None] * (last - first)
@@ -200,8 +201,9 @@ def helix(
         radius: distance from it [m].
         angles: of the first and the last point about it, from +x to +y [rad].
         heights: z of both [m]; falls evenly in between.
-        spacing: largest distance of two points [m].
+        spacing: largest distance of two points, > 0 [m].
     """
+    check_positive("spacing", spacing)
     turned = angles[1] - angles[0]
     intervals = max(int(np.ceil(np.hypot(radius * turned, heights[1] - heights[0]) / spacing)), 3)
     share = np.linspace(0.0, 1.0, intervals + 1)
@@ -216,7 +218,7 @@ def ramp(start: Sequence[float], end: Sequence[float], *, spacing: float) -> Flo
     Args:
         start: first point [m].
         end: last point [m].
-        spacing: largest distance of two points, seen from above [m].
+        spacing: largest distance of two points, seen from above, > 0 [m].
     """
     first, last = np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64)
     level = straight((first[0], first[1], 0.0), (last[0], last[1], 0.0), spacing=spacing)

@@ -3,7 +3,8 @@
 Each test prints its table (`-s` shows it) and notes it in `extra_info`. Repeats are interleaved. One thread is timed by
 its CPU time, two by the wall, as they have no other: on a busy machine the second table is worth nothing. A ratio is
 that of the minima, beside the median of the repeats' own ratios. Targets of time are printed, never asserted; errors,
-energy and what every law claims are.
+energy and what every law claims are. QCE and EHI find made what depends on the geometry alone, as a problem keeps it:
+packed rows, and chunks for EHI; what the chunks take is printed.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from solvers.explicit_hertz import ExplicitHertz
 from solvers.hertz import Hertz
 from solvers.newton_lcp import NewtonLcp
 from solvers.solution import Floats, Solver
+from solvers.sphere_chunks import chunks
 
 pytestmark = pytest.mark.long
 
@@ -99,6 +101,15 @@ def times_in_turn(laws: Mapping[str, Solver], problem: ImpactProblem, clock: Cal
     return {name: np.array(taken) for name, taken in times.items()}
 
 
+def time_of_chunks(problem: ImpactProblem, clock: Callable[[], float]) -> float:
+    """Time [s] of what EHI asks of packed contacts once."""
+    assert problem.spheres_at_rest is not None
+    start = clock()
+    made = chunks(problem.spheres_at_rest)
+    assert made.rates_of_equals.size == problem.m <= made.contacts_of_body[1].size
+    return clock() - start
+
+
 @pytest.mark.parametrize("start", ["kick", "hot"])
 @pytest.mark.parametrize("setting", SETTINGS)
 def test_error_against_the_compliant_reference(benchmark: Any, start: str, setting: tuple[float, float]) -> None:
@@ -117,11 +128,14 @@ def test_time_beside_qce_over_sizes(benchmark: Any, start: str, threads: int) ->
     laws = {"qce": SOLVERS["qce"](), "ehi coarse": ehi(COARSE), "ehi fine": ehi(FINE)}
     contacts = [layer(spheres, start).m for spheres in SPHERES]
     clock = time.thread_time if threads == 1 else time.perf_counter
+    problem = layer(SPHERES[-1], start)
     with threads_of(threads):
         times = [times_in_turn(laws, layer(spheres, start), clock) for spheres in SPHERES]
     print(f"\n{start}, threads: {threads}; ms: minimum (median); times QCE: of the minima (median of the repeats)")
     for m, taken in zip(contacts, times, strict=True):
         print(f"{m:7d} contacts", *(cell(name, taken) for name in laws), sep="  ")
+    with threads_of(threads):
+        print(f"chunks of {m} contacts: {1e3 * min(time_of_chunks(problem, clock) for _ in range(REPEATS)):.1f} ms")
     for name in laws:
         fit = fit_power_law(contacts, [taken[name].min() for taken in times])
         print(f"exponent of {name}: {fit.exponent:.3f} ({fit.low:.3f} to {fit.high:.3f})")

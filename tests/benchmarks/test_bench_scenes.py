@@ -18,7 +18,7 @@ from solvers.qce_lcp import QceLcp
 
 pytestmark = pytest.mark.long
 
-LAW = QceLcp(tolerance=1e-6, max_sweeps=1000)
+LAW = QceLcp(tolerance=1e-9, max_sweeps=1000)
 # Steps that are timed; the first ones, in which kernels are compiled, are not.
 STEPS, WARM = 500, 5
 
