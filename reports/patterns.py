@@ -89,8 +89,8 @@ def patterns_markdown(records: Sequence[PatternRecord]) -> str:
         "",
         "Q2, Q4 and Q6 are the published recipe: order of the whole map. ψ4 and ψ6 are the order about each peak away "
         "from the walls (1 for four, or six, neighbors at equal angles; about 0.5 both for few peaks at random). "
-        "Skewness is that of the heights: hexagons show peaks in one cycle (> 0) and cells in the next one (about 0 and "
-        "less); in squares and stripes what is up is like what is down half a wavelength away.",
+        "Skewness is that of the heights: hexagons show peaks in one cycle (> 0) and cells in the next one (about 0 "
+        "and less); in squares and stripes what is up is like what is down half a wavelength away.",
         "",
         *markdown_table(
             ("pattern", "whose", "cycle", *MEASURES.values(), "pattern stands"),
