@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import textwrap
 from collections.abc import Callable
 from pathlib import Path
@@ -15,6 +16,12 @@ from dataclasses import dataclass
 import numpy as np
 from solvers import ImpactProblem, ImpactSolution, Status, UnsupportedProblem
 """
+
+
+def pytest_configure() -> None:
+    """Let what the tests start be interrupted: a shell's background jobs, these tests too, are begun deaf to SIGINT."""
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(scope="session")
