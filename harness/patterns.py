@@ -6,7 +6,7 @@
         run       ()                 JSON: scene, solver, seed, statistics of all steps, machine
 
 All maps are of the beginning of a cycle, when the plate goes up through its middle. Patterns repeat every two cycles:
-maps ten cycles apart show the same one of the two, and a run of an odd number of cycles ends with a map of the other.
+maps ten cycles apart show the same one of the two. A run whose last frame is of an odd cycle has a map of the other.
 """
 
 from __future__ import annotations
