@@ -35,10 +35,13 @@ Source: Zhang 2015, Algorithm 1, as corrected in `quadratic_contact_energy`; the
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
 
-from solvers._jit import alone, kernel, parallel_kernel, prange, prefetch
+from solvers import _jit
+from solvers._jit import alone, kernel, parallel_kernel, prange
 from solvers.problem import ImpactProblem
 from solvers.qce_heap import MAX_VISITS
 from solvers.solution import Floats
@@ -173,6 +176,12 @@ def _end_by_pieces(
 
 
 @kernel
+def _ask(array: npt.NDArray[Any], place: int | np.unsignedinteger[Any]) -> None:
+    """Ask for an entry of a flat array ahead of its turn; no result depends on it."""
+    _jit.prefetch(array, place)
+
+
+@kernel
 def _sweep(
     begin: int, stop: int, first: int, last: int, due: Indices, load: Floats, start: Indices, neighbor: Indices,
     coupling: Floats, end: Floats, awake: Flags, woken: Indices, count: int,
@@ -187,14 +196,14 @@ def _sweep(
         # Contacts are due in another order than they lie in memory, which is beyond the caches near the core.
         if place + HEAD_AHEAD < size:
             j = due[place + HEAD_AHEAD]
-            prefetch(start, j + j)
-            prefetch(load, j + j)
+            _ask(start, j + j)
+            _ask(load, j + j)
         if place + ROW_AHEAD < size:
             j = due[place + ROW_AHEAD]
-            prefetch(end, j)
-            prefetch(neighbor, start[j, 0])
-            prefetch(coupling, start[j, 0])
-            prefetch(coupling, start[j, 0] + LINE)
+            _ask(end, j)
+            _ask(neighbor, start[j, 0])
+            _ask(coupling, start[j, 0])
+            _ask(coupling, start[j, 0] + LINE)
         k = due[place]
         before = end[k]
         row, row_stop = start[k, 0], start[k, 1]

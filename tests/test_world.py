@@ -424,7 +424,7 @@ def test_contacts_without_memory_of_their_own_are_the_same() -> None:
 @pytest.mark.kernels
 def test_spheres_in_one_place_are_refused() -> None:
     place = np.tile([[1.0, 1.0, 1.0, 0.5]], (60, 1))
-    with pytest.raises(ProblemError, match="more than 24 pairs a sphere"):
+    with pytest.raises(ProblemError, match="more than 16 contacts a sphere"):
         find_contacts(place, Container())
 
 

@@ -40,7 +40,7 @@ STRIPES = 16
 
 # A sphere touches at most about 14 others that do not overlap, half of which count it, and a few walls; a few more are
 # within reach.
-MOST_NEIGHBORS = 24
+MOST_CONTACTS = 16
 # Contacts count as touching below this gap over the smallest radius: positions carry rounding.
 TOUCHING = 1e-9
 # A pair of numbers is one entry: the later one in its upper half. Walls are numbered after the spheres.
@@ -227,12 +227,12 @@ def find_neighbors(
     if used > 1:
         furthest = 0.5 * (rows // used * step[1] - 2.0 * largest - slack)
     # Each stripe has room for one sphere's comparisons more: what is no pair is written as well, and then overwritten.
-    room = buffers.array("neighbor", ((MOST_NEIGHBORS + STRIPES) * bodies,), np.uint64)
+    room = buffers.array("neighbor", ((MOST_CONTACTS + STRIPES) * bodies,), np.uint64)
     count = _compare(
         sorted_place, first, (rows, columns), row_start, container.planes, container.drums, drift, slack, room
     )
     if (count < 0).any():
-        raise ProblemError(f"position: a region has more than {MOST_NEIGHBORS} pairs a sphere: the spheres overlap")
+        raise ProblemError(f"position: a region has more than {MOST_CONTACTS} contacts a sphere: the spheres overlap")
     stripe = np.zeros(STRIPES + 1, dtype=np.int32)
     np.cumsum(count.sum(axis=1), out=stripe[1:])
     pair = buffers.array("pair", (int(stripe[-1]),), np.uint64)
@@ -380,7 +380,7 @@ def _compare_rows(
 @kernel
 def _room(bodies: int, begin: int, stripe: int) -> int:
     """Where the room of a stripe begins whose first sphere in the sorted order is `begin`."""
-    return int(MOST_NEIGHBORS * np.int64(begin) + np.int64(stripe) * bodies)
+    return int(MOST_CONTACTS * np.int64(begin) + np.int64(stripe) * bodies)
 
 
 @parallel_kernel
@@ -396,7 +396,7 @@ def _compare(
         begin = first[begin_row * shape[1]]
         end = first[end_row * shape[1]]
         own = _room(place.shape[1], begin, stripe)
-        most = own + MOST_NEIGHBORS * (end - begin)
+        most = own + MOST_CONTACTS * (end - begin)
         walls = _near_walls(place, begin, end, planes, drums, drift, slack, room, own, most)
         size = walls
         if size <= most:
