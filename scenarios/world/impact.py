@@ -4,6 +4,20 @@
 
 The same impact goes to any solver as an `ImpactProblem` (`ByProblem`), or, for many spheres, straight from the arrays
 into QCE and the LCP with friction (`Streamed`): no sparse matrix, no copy of the scene.
+
+A restitution e(v) that depends on the speed is known of collisions of two bodies. Where many contacts collide at once,
+one whose bodies move alike beforehand has u_pre = 0 and is struck all the same as the wave goes by, more than once
+where it bounces to and fro. QCE, in which nothing is lost, tells of each contact i
+
+    b_i = ½ W_ii λ_i       its blow: the approach speed of the one collision of its two bodies with this impulse
+    n_i = max(b_i / u_i, 1)    how many collisions in a row that takes, if each of them parts with u_i
+    c_i = e(b_i)^n_i min(b_i / u_i, 1)
+
+and c_i is the coefficient of restitution that the laws are given; u_i is QCE's velocity afterwards, 0 < u_i. A contact
+that neighbors draw apart faster than it was struck gives back what it was struck with. Of one collision b = u = -u_pre,
+so that c = e(-u_pre). `tests/benchmarks/test_bench_world.py` prints how layers land beside soft spheres (`-k landing`);
+with e(-u_pre) for all contacts the inner ones of a layer that lands lose nothing, and waves stand on a layer that
+Bizon 1998 saw flat.
 """
 
 from __future__ import annotations
@@ -12,7 +26,7 @@ import inspect
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 import scipy.sparse as sp
@@ -31,10 +45,17 @@ from solvers.spinning_spheres import SpinningRows, sweep_spheres
 
 # Factor of every other sweep's changes; relaxation by 2 and more never settles.
 OVERSHOOT = 1.7
+# A contact approaches in the QCE step when u < -QCE_TOLERANCE times the largest |u_pre|.
+QCE_TOLERANCE = 1e-10
+# Bound on QCE's outer iterations.
+QCE_ITERATIONS = 10_000
 
 
 class Restitution(Protocol):
     """Coefficient of restitution as a function of the speed of an impact."""
+
+    by_blow: ClassVar[bool]
+    """Whether the speed is that of the blow that a contact takes in the impact, or of the approach before it."""
 
     def of(self, speed: Floats) -> Floats:
         """c_r in [0, 1], shape (m,), for speeds ≥ 0 [m/s], shape (m,)."""
@@ -45,6 +66,7 @@ class Restitution(Protocol):
 class Constant:
     """The same for all impacts but the slowest."""
 
+    by_blow: ClassVar[bool] = False
     value: float
     """c_r in [0, 1]."""
 
@@ -58,8 +80,9 @@ class Constant:
 
 @dataclass(frozen=True)
 class SlowingRestitution:
-    """e = max(1 - B v^(3/4), floor) (Bizon 1998)."""
+    """e = max(1 - B v^(3/4), floor) of a collision of two bodies (Bizon 1998)."""
 
+    by_blow: ClassVar[bool] = True
     loss: float = 0.3
     """B, for speeds in units of √(gD)."""
 
@@ -70,6 +93,18 @@ class SlowingRestitution:
         """c_r for speeds ≥ 0 [m/s], shape (m,)."""
         root = np.sqrt(speed)
         return np.maximum(1.0 - self.loss * root * np.sqrt(root), self.floor)
+
+
+@dataclass(frozen=True)
+class Elastic:
+    """QCE's answer to an impact in which nothing is lost (Zhang 2015, Sec. 4)."""
+
+    V: Floats
+    """Velocity and inverse mass of each body, shape (bodies + 1, 4)."""
+    impulse: Floats
+    """λ [N s], shape (m,)."""
+    iterations: int
+    stalled: bool
 
 
 @dataclass(frozen=True)
@@ -102,15 +137,36 @@ class Impact:
         return float(max(self.u_pre.max(initial=0.0), -self.u_pre.min(initial=0.0)))
 
     @cached_property
+    def elastic(self) -> Elastic:
+        """QCE's answer, for velocities before the impact."""
+        contacts = self.contacts
+        V = self.buffers.array("V", (len(self.motion), 4))
+        _without_spin(self.motion, V)
+        rows = SphereRows(contacts.normal, contacts.body, V, _NO_CONTACTS, strip=contacts.stripe)
+        impulse, iterations, _, flag = solve_spheres(
+            rows, threshold=QCE_TOLERANCE * self.speed, defer=0.0, max_iterations=QCE_ITERATIONS
+        )
+        return Elastic(V, impulse, iterations, bool(flag))
+
+    @cached_property
     def coefficient(self) -> Floats:
         """Coefficient of restitution of each contact, shape (m,)."""
-        approach = np.negative(self.u_pre, out=self.buffers.array("approach", (self.contacts.m,)))
-        return self.restitution.of(np.maximum(approach, 0.0, out=approach))
+        contacts = self.contacts
+        speed, parting = (self.buffers.array(name, (contacts.m,)) for name in ("speed", "parting"))
+        if not self.restitution.by_blow:
+            np.negative(self.u_pre, out=speed)
+            return self.restitution.of(np.maximum(speed, 0.0, out=speed))
+        V, impulse = self.elastic.V, self.elastic.impulse
+        _blows(contacts.normal, contacts.body, contacts.stripe, V, impulse, speed, parting)
+        coefficient = self.restitution.of(speed)
+        _repeat(contacts.stripe, speed, parting, coefficient)
+        return coefficient
 
     @cached_property
     def pair(self) -> Ints | None:
         """Labels of the two bodies of each contact, shape (m, 2); None where nothing lies."""
-        return labels_of(self.contacts, self.label) if (self.coefficient == 0.0).any() else None
+        lies = not self.restitution.by_blow and (self.coefficient == 0.0).any()
+        return labels_of(self.contacts, self.label) if lies else None
 
     def guess(self) -> Floats:
         """First guess of λ, λ₁ and λ₂ [N s], shape (m, 3): what lies has the last step's impulses, the rest none."""
@@ -233,12 +289,6 @@ class Streamed:
     least_visits: int = 50_000
     """Contact visits before the bound on sweeps counts: few contacts are swept to the tolerance in no time."""
 
-    qce_tolerance: float = 1e-10
-    """A contact approaches in the QCE step when u < -qce_tolerance times the largest |u_pre|."""
-
-    max_iterations: int = 10_000
-    """Bound on QCE's outer iterations."""
-
     def resolve(self, impact: Impact) -> Outcome:
         """Solve one impact; `impact.motion` becomes the velocities after it."""
         contacts, buffers = impact.contacts, impact.buffers
@@ -250,7 +300,7 @@ class Streamed:
         iterations, status = 0, Status.CONVERGED
         # QCE has no part in an inelastic impact.
         if restitution.any():
-            iterations, status = self._predict(impact, start, target)
+            iterations, status = _predict(impact, start, target)
         result = sweep_spheres(
             SpinningRows(contacts.normal, contacts.body, impact.motion, contacts.stripe),
             target, start, friction=impact.friction, inertia=INVERSE_INERTIA,
@@ -262,19 +312,17 @@ class Streamed:
         impulses = NO_IMPULSES if pair is None else LastImpulses(pair, result.impulse)
         return Outcome(status, iterations, result.sweeps, residual, result.normal_work, impulses)
 
-    def _predict(self, impact: Impact, start: Floats, target: Floats) -> tuple[int, Status]:
-        """Solve QCE, and form of its answer the first guess of λ and the velocity to reach; returns its iterations."""
-        contacts, restitution = impact.contacts, impact.coefficient
-        threshold = self.qce_tolerance * impact.speed
-        V = impact.buffers.array("V", (len(impact.motion), 4))
-        _without_spin(impact.motion, V)
-        rows = SphereRows(contacts.normal, contacts.body, V, _NO_CONTACTS, strip=contacts.stripe)
-        impulse, iterations, _, flag = solve_spheres(
-            rows, threshold=threshold, defer=0.0, max_iterations=self.max_iterations
-        )
-        least = _aim(contacts.normal, contacts.body, contacts.stripe, V, restitution, impulse, start, target)
-        status = Status.ITERATION_LIMIT if least < -threshold else Status.CONVERGED
-        return iterations, Status.STALLED if flag else status
+
+def _predict(impact: Impact, start: Floats, target: Floats) -> tuple[int, Status]:
+    """Form of QCE's answer the first guess of λ and the velocity to reach; returns its iterations."""
+    contacts, elastic = impact.contacts, impact.elastic
+    least = _aim(
+        contacts.normal, contacts.body, contacts.stripe, elastic.V, impact.coefficient, elastic.impulse, start, target
+    )
+    if elastic.stalled:
+        return elastic.iterations, Status.STALLED
+    approaches = least < -QCE_TOLERANCE * impact.speed
+    return elastic.iterations, Status.ITERATION_LIMIT if approaches else Status.CONVERGED
 
 
 _NO_CONTACTS = np.zeros(0, dtype=np.int32)
@@ -309,6 +357,42 @@ def _without_spin(motion: Floats, V: Floats) -> None:
         for b in range(bodies * part // PARTS, bodies * (part + 1) // PARTS):
             for column in range(4):
                 V[b, column] = motion[b, column]
+
+
+@kernel
+def _blow_stripe(
+    normal: Floats, body: Indices, V: Floats, begin: int, end: int, impulse: Floats, blow: Floats, parting: Floats
+) -> None:
+    """As `_blows`, for some contacts."""
+    for i in range(np.uint64(begin), np.uint64(end)):
+        a = body[i, 0]
+        b = body[i, 1]
+        parting[i] = (
+            normal[i, 0] * (V[b, 0] - V[a, 0]) + normal[i, 1] * (V[b, 1] - V[a, 1]) + normal[i, 2] * (V[b, 2] - V[a, 2])
+        )
+        blow[i] = 0.5 * (V[a, 3] + V[b, 3]) * impulse[i]
+
+
+@parallel_kernel
+def _blows(
+    normal: Floats, body: Indices, stripe: Ints, V: Floats, impulse: Floats, blow: Floats, parting: Floats
+) -> None:
+    """Fill ½ W_ii λ_i and u_i of velocities V [m/s], shape (m,)."""
+    for k in prange(stripe.size - 1):
+        _blow_stripe(normal, body, V, stripe[k], stripe[k + 1], impulse, blow, parting)
+
+
+@parallel_kernel
+def _repeat(stripe: Ints, blow: Floats, parting: Floats, coefficient: Floats) -> None:
+    """Make c_i of e(b_i), in place; 0 where nothing parts."""
+    for k in prange(stripe.size - 1):
+        for i in range(stripe[k], stripe[k + 1]):
+            b = blow[i]
+            u = parting[i]
+            if b <= u:
+                coefficient[i] *= b / u if u > 0.0 else 0.0
+            else:
+                coefficient[i] = coefficient[i] ** (b / u) if u > 0.0 else 0.0
 
 
 @kernel
