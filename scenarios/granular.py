@@ -75,7 +75,7 @@ def extended_pattern(
         pattern: "squares", "stripes", "hexagons" or "flat": the driving under which it was seen.
         side: of the box [D], ≥ 4; 6 grains stand on each D².
         steps_per_cycle: time steps in a period of the plate, ≥ 50; None: the fewest of at most `LONGEST_STEP`.
-        restitution: of all contacts, in [0, 1]; None: e = max(1 - 0.3 v^(3/4), 0.7).
+        restitution: of all contacts, in [0, 1]; None: e = max(1 - 0.3 v^(3/4), 0.7), v of each contact's blow.
         friction: coefficient of all contacts, ≥ 0.
 
     Unlike in Bizon 1998, a contact that sticks keeps no tangential velocity: the tangential restitution β₀ = 0.35 is

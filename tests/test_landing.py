@@ -1,0 +1,134 @@
+"""Layers that land on a vibrating plate, beside soft spheres.
+
+`pytest -m long -s tests/test_landing.py` prints what a landing leaves, by time step and by how the restitution is
+found, and how rough a layer is that should lie flat.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from scenarios.granular import extended_pattern, pattern_measures, vibration
+from scenarios.world.impact import Constant, SlowingRestitution
+from scenarios.world.stepping import World
+from tests.soft_spheres import SoftLayer, fluctuation
+
+# A layer of 2,400 grains, whose first landings shake off the start; the next one is looked at.
+SIDE = 20
+BEFORE = 4
+# Contacts of 0.005 √(D/g): the grains overlap by 0.01 D.
+STIFFNESS = 200_000.0
+# Of the flat control: 15,000 grains.
+FLAT_SIDE = 50
+FLAT_CYCLES = 25
+
+
+class ByApproach(SlowingRestitution):
+    """The same e(v), of the approach before the impact."""
+
+    by_blow = False
+
+
+def test_two_soft_spheres_part_with_their_restitution() -> None:
+    layer = SoftLayer("flat", 4, STIFFNESS, friction=0.0)
+    # High above the plate, all but two out of the way.
+    layer.place[:] = [[1.0 + 1.0 * (k % 3), 1.0, 60.0 + 2.0 * k] for k in range(len(layer.place))]
+    layer.place[:2] = [[1.0, 3.0, 50.0], [2.2, 3.0, 50.0]]
+    layer.velocity[:] = 0.0
+    layer.velocity[0, 0] = 0.6
+    layer.renew()
+    layer.go(0.6)
+    parting = layer.velocity[1, 0] - layer.velocity[0, 0]
+    assert parting == pytest.approx(0.6 * (1.0 - 0.3 * 0.6**0.75), rel=5e-3)
+    assert layer.mass[:2] @ layer.velocity[:2, 0] == pytest.approx(0.6 * layer.mass[0], rel=1e-12)
+
+
+def test_a_soft_sphere_that_slides_rolls_at_last() -> None:
+    # v -> 5/7 v; it bounces on the plate, which changes how hard it is pressed, not where this ends.
+    layer = SoftLayer("flat", 9, STIFFNESS, restitution=0.5)
+    # All others fall from so high that they do not arrive.
+    layer.place[:] = [[4.5, 4.5, 600.0 + 2.0 * k] for k in range(len(layer.place))]
+    layer.place[0] = [2.0, 4.5, layer.radius[0]]
+    layer.velocity[:] = 0.0
+    layer.velocity[0, 0] = 0.21
+    layer.renew()
+    layer.go(20.0)
+    assert layer.velocity[0, 0] == pytest.approx(0.15, rel=1e-3)
+    assert layer.spin[0, 1] == pytest.approx(0.15, rel=1e-3)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("pattern", ["flat", "hexagons", "squares"])
+def test_a_layer_lands_as_soft_spheres_do(pattern: str) -> None:
+    period = vibration(pattern).period
+    layer = SoftLayer(pattern, SIDE, STIFFNESS)
+    layer.go(BEFORE * period)
+    start = layer.place.copy(), layer.velocity.copy(), layer.spin.copy()
+    layer.go((BEFORE + 1) * period)
+    expected = fluctuation(layer.velocity, layer.mass), *vertical(layer.place, layer.velocity, layer.mass)
+    print(f"\n{pattern}: energy about the mean motion [gD], height [D] and speed [√(gD)] a cycle later")
+    print(f"  soft spheres                   {expected[0]:.4f}  {expected[1]:6.3f}  {expected[2]:6.3f}")
+    found = {}
+    for name, restitution, finer in (
+        ("blows", SlowingRestitution(), 1), ("blows", SlowingRestitution(), 4), ("approach", ByApproach(), 1),
+        ("approach", ByApproach(), 4), ("0.7", Constant(0.7), 1), ("0.3", Constant(0.3), 1),
+    ):  # fmt: skip
+        world = landing(pattern, start, restitution, finer)
+        spheres = world.spheres
+        mass = 1.0 / spheres.motion[:-1, 3]
+        found[name, finer] = fluctuation(spheres.velocity, mass), *vertical(spheres.position, spheres.velocity, mass)
+        numbers = "{:.4f}  {:6.3f}  {:6.3f}".format(*found[name, finer])
+        print(f"  e of {name:8s} {round(world.period / world.settings.step):5d} steps     {numbers}")
+    energy, height, speed = found["blows", 1]
+    assert energy == pytest.approx(expected[0], rel=0.15)
+    assert height == pytest.approx(expected[1], abs=0.2)
+    assert speed == pytest.approx(expected[2], abs=0.05)
+    for by_blow, by_approach, reference in zip(found["blows", 1], found["approach", 1], expected, strict=True):
+        assert abs(by_blow - reference) < abs(by_approach - reference)
+
+
+@pytest.mark.long
+def test_a_layer_lies_flat_where_it_should() -> None:
+    scene = extended_pattern(pattern="flat", side=FLAT_SIDE)
+    assert scene.steps_per_cycle is not None
+    rough = {}
+    for name, restitution in (("blows", SlowingRestitution()), ("approach", ByApproach())):
+        world = scene.world(solver="qce-lcp-fast", seed=0)
+        assert isinstance(world, World)
+        world.settings = replace(world.settings, restitution=restitution)
+        for _ in range(FLAT_CYCLES * scene.steps_per_cycle):
+            world.step()
+        measures = pattern_measures(float(FLAT_SIDE), world)
+        rough[name] = measures["roughness [D]"]
+        print(f"\ne of {name}: roughness {rough[name]:.2f} D after {FLAT_CYCLES} cycles, share {measures['share']:.2f}")
+    # The heights of a layer that is loose, against waves that grow.
+    assert rough["blows"] < 0.6 < rough["approach"]
+
+
+def landing(
+    pattern: str, start: tuple[np.ndarray, ...], restitution: SlowingRestitution | Constant, finer: int
+) -> World:
+    """The layer a cycle later, with so many times as many steps."""
+    steps = extended_pattern(pattern=pattern, side=SIDE).steps_per_cycle
+    assert steps is not None
+    scene = extended_pattern(pattern=pattern, side=SIDE, steps_per_cycle=finer * steps)
+    world = scene.world(solver="qce-lcp-fast", seed=0)
+    assert isinstance(world, World)
+    motion = world.spheres.motion.copy()
+    motion[:-1, :3], motion[:-1, 4:7] = start[1:]
+    place = np.column_stack([start[0], world.spheres.radius])
+    at = {**world.state(), "place": place, "motion": motion, "listed place": place.copy()}
+    height = float(np.average(start[0][:, 2], weights=1.0 / motion[:-1, 3]))
+    world.restore({**at, "steps": np.array(BEFORE * finer * steps), "listed height": np.array(height)})
+    world.settings = replace(world.settings, restitution=restitution)
+    for _ in range(finer * steps):
+        world.step()
+    return world
+
+
+def vertical(place: np.ndarray, velocity: np.ndarray, mass: np.ndarray) -> tuple[float, float]:
+    """Mean height and vertical speed, weighted with the masses."""
+    return float(np.average(place[:, 2], weights=mass)), float(np.average(velocity[:, 2], weights=mass))
