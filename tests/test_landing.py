@@ -16,9 +16,10 @@ from scenarios.world.impact import Constant, SlowingRestitution
 from scenarios.world.stepping import World
 from tests.soft_spheres import SoftLayer, fluctuation
 
-# A layer of 2,400 grains, whose first landings shake off the start; the next one is looked at.
+# A layer of 2,400 grains, and how many cycles have shaken off the start: of hexagons and squares a layer lands hard in
+# one cycle and softly in the next.
 SIDE = 20
-BEFORE = 4
+LANDINGS = [("flat", 3), ("flat", 4), ("hexagons", 3), ("hexagons", 4), ("squares", 3), ("squares", 4)]
 # Contacts of 0.005 √(D/g): the grains overlap by 0.01 D.
 STIFFNESS = 200_000.0
 # Of the flat control: 15,000 grains.
@@ -61,22 +62,24 @@ def test_a_soft_sphere_that_slides_rolls_at_last() -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("pattern", ["flat", "hexagons", "squares"])
-def test_a_layer_lands_as_soft_spheres_do(pattern: str) -> None:
+@pytest.mark.parametrize(("pattern", "before"), LANDINGS)
+def test_a_layer_lands_as_soft_spheres_do(pattern: str, before: int) -> None:
     period = vibration(pattern).period
     layer = SoftLayer(pattern, SIDE, STIFFNESS)
-    layer.go(BEFORE * period)
+    layer.go(before * period)
     start = layer.place.copy(), layer.velocity.copy(), layer.spin.copy()
-    layer.go((BEFORE + 1) * period)
+    layer.go((before + 1) * period)
     expected = fluctuation(layer.velocity, layer.mass), *vertical(layer.place, layer.velocity, layer.mass)
-    print(f"\n{pattern}: energy about the mean motion [gD], height [D] and speed [√(gD)] a cycle later")
+    print(
+        f"\n{pattern}, cycle {before + 1}: energy about the mean motion [gD], height [D] and speed [√(gD)] a cycle later"
+    )
     print(f"  soft spheres                   {expected[0]:.4f}  {expected[1]:6.3f}  {expected[2]:6.3f}")
     found = {}
     for name, restitution, finer in (
         ("blows", SlowingRestitution(), 1), ("blows", SlowingRestitution(), 4), ("approach", ByApproach(), 1),
         ("approach", ByApproach(), 4), ("0.7", Constant(0.7), 1), ("0.3", Constant(0.3), 1),
     ):  # fmt: skip
-        world = landing(pattern, start, restitution, finer)
+        world = landing(pattern, before, start, restitution, finer)
         spheres = world.spheres
         mass = 1.0 / spheres.motion[:-1, 3]
         found[name, finer] = fluctuation(spheres.velocity, mass), *vertical(spheres.position, spheres.velocity, mass)
@@ -109,7 +112,7 @@ def test_a_layer_lies_flat_where_it_should() -> None:
 
 
 def landing(
-    pattern: str, start: tuple[np.ndarray, ...], restitution: SlowingRestitution | Constant, finer: int
+    pattern: str, before: int, start: tuple[np.ndarray, ...], restitution: SlowingRestitution | Constant, finer: int
 ) -> World:
     """The layer a cycle later, with so many times as many steps."""
     steps = extended_pattern(pattern=pattern, side=SIDE).steps_per_cycle
@@ -122,7 +125,7 @@ def landing(
     place = np.column_stack([start[0], world.spheres.radius])
     at = {**world.state(), "place": place, "motion": motion, "listed place": place.copy()}
     height = float(np.average(start[0][:, 2], weights=1.0 / motion[:-1, 3]))
-    world.restore({**at, "steps": np.array(BEFORE * finer * steps), "listed height": np.array(height)})
+    world.restore({**at, "steps": np.array(before * finer * steps), "listed height": np.array(height)})
     world.settings = replace(world.settings, restitution=restitution)
     for _ in range(finer * steps):
         world.step()

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 Arrays = dict[str, npt.NDArray[Any]]
 
-FORMAT = 5
+FORMAT = 6
 """Changes whenever the same start gives another trajectory, or the file another meaning."""
 FORMAT_FIELD = "format"
 IDENTITY_FIELD = "identity"

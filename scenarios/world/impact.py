@@ -11,7 +11,7 @@ where it bounces to and fro. QCE, in which nothing is lost, tells of each contac
 
     b_i = ½ W_ii λ_i       its blow: the approach speed of the one collision of its two bodies with this impulse
     n_i = max(b_i / u_i, 1)    how many collisions in a row that takes, if each of them parts with u_i
-    c_i = e(b_i)^n_i min(b_i / u_i, 1)
+    c_i = e(b_i / n_i)^n_i min(b_i / u_i, 1)
 
 and c_i is the coefficient of restitution that the laws are given; u_i is QCE's velocity afterwards, 0 < u_i. A contact
 that neighbors draw apart faster than it was struck gives back what it was struck with. Of one collision b = u = -u_pre,
@@ -152,14 +152,15 @@ class Impact:
     def coefficient(self) -> Floats:
         """Coefficient of restitution of each contact, shape (m,)."""
         contacts = self.contacts
-        speed, parting = (self.buffers.array(name, (contacts.m,)) for name in ("speed", "parting"))
+        speed = self.buffers.array("speed", (contacts.m,))
         if not self.restitution.by_blow:
             np.negative(self.u_pre, out=speed)
             return self.restitution.of(np.maximum(speed, 0.0, out=speed))
         V, impulse = self.elastic.V, self.elastic.impulse
-        _blows(contacts.normal, contacts.body, contacts.stripe, V, impulse, speed, parting)
+        blow, parting = (self.buffers.array(name, (contacts.m,)) for name in ("blow", "parting"))
+        _blows(contacts.normal, contacts.body, contacts.stripe, V, impulse, blow, parting, speed)
         coefficient = self.restitution.of(speed)
-        _repeat(contacts.stripe, speed, parting, coefficient)
+        _repeat(contacts.stripe, blow, parting, coefficient)
         return coefficient
 
     @cached_property
@@ -361,8 +362,9 @@ def _without_spin(motion: Floats, V: Floats) -> None:
 
 @kernel
 def _blow_stripe(
-    normal: Floats, body: Indices, V: Floats, begin: int, end: int, impulse: Floats, blow: Floats, parting: Floats
-) -> None:
+    normal: Floats, body: Indices, V: Floats, begin: int, end: int, impulse: Floats, blow: Floats, parting: Floats,
+    speed: Floats,
+) -> None:  # fmt: skip
     """As `_blows`, for some contacts."""
     for i in range(np.uint64(begin), np.uint64(end)):
         a = body[i, 0]
@@ -371,20 +373,22 @@ def _blow_stripe(
             normal[i, 0] * (V[b, 0] - V[a, 0]) + normal[i, 1] * (V[b, 1] - V[a, 1]) + normal[i, 2] * (V[b, 2] - V[a, 2])
         )
         blow[i] = 0.5 * (V[a, 3] + V[b, 3]) * impulse[i]
+        speed[i] = max(min(blow[i], parting[i]), 0.0)
 
 
 @parallel_kernel
 def _blows(
-    normal: Floats, body: Indices, stripe: Ints, V: Floats, impulse: Floats, blow: Floats, parting: Floats
-) -> None:
-    """Fill ½ W_ii λ_i and u_i of velocities V [m/s], shape (m,)."""
+    normal: Floats, body: Indices, stripe: Ints, V: Floats, impulse: Floats, blow: Floats, parting: Floats,
+    speed: Floats,
+) -> None:  # fmt: skip
+    """Fill b_i = ½ W_ii λ_i, u_i of velocities V, and the speed b_i / n_i of each collision [m/s], shape (m,)."""
     for k in prange(stripe.size - 1):
-        _blow_stripe(normal, body, V, stripe[k], stripe[k + 1], impulse, blow, parting)
+        _blow_stripe(normal, body, V, stripe[k], stripe[k + 1], impulse, blow, parting, speed)
 
 
 @parallel_kernel
 def _repeat(stripe: Ints, blow: Floats, parting: Floats, coefficient: Floats) -> None:
-    """Make c_i of e(b_i), in place; 0 where nothing parts."""
+    """Make c_i of e(b_i / n_i), in place; 0 where nothing parts."""
     for k in prange(stripe.size - 1):
         for i in range(stripe[k], stripe[k + 1]):
             b = blow[i]
