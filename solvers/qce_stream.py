@@ -177,7 +177,10 @@ def _end_by_pieces(
 
 @kernel
 def _ask(array: npt.NDArray[Any], place: int | np.unsignedinteger[Any]) -> None:
-    """Ask for an entry of a flat array ahead of its turn; no result depends on it."""
+    """Ask for an entry of a flat array ahead of its turn.
+
+    The one call into another file, whose edits numba's cache does not see: no result depends on it.
+    """
     _jit.prefetch(array, place)
 
 

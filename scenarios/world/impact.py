@@ -99,10 +99,10 @@ class SlowingRestitution:
 class Elastic:
     """QCE's answer to an impact in which nothing is lost (Zhang 2015, Sec. 4)."""
 
-    V: Floats
-    """Velocity and inverse mass of each body, shape (bodies + 1, 4)."""
     impulse: Floats
     """λ [N s], shape (m,)."""
+    parting: Floats
+    """Normal relative velocity after it [m/s], shape (m,)."""
     iterations: int
     stalled: bool
 
@@ -146,7 +146,9 @@ class Impact:
         impulse, iterations, _, flag = solve_spheres(
             rows, threshold=QCE_TOLERANCE * self.speed, defer=0.0, max_iterations=QCE_ITERATIONS
         )
-        return Elastic(V, impulse, iterations, bool(flag))
+        parting = self.buffers.array("parting", (contacts.m,))
+        _relative_velocity(contacts.normal, contacts.body, contacts.stripe, V, parting)
+        return Elastic(impulse, parting, iterations, bool(flag))
 
     @cached_property
     def coefficient(self) -> Floats:
@@ -156,16 +158,16 @@ class Impact:
         if not self.restitution.by_blow:
             np.negative(self.u_pre, out=speed)
             return self.restitution.of(np.maximum(speed, 0.0, out=speed))
-        V, impulse = self.elastic.V, self.elastic.impulse
-        blow, parting = (self.buffers.array(name, (contacts.m,)) for name in ("blow", "parting"))
-        _blows(contacts.normal, contacts.body, contacts.stripe, V, impulse, blow, parting, speed)
+        elastic, blow = self.elastic, self.buffers.array("blow", (contacts.m,))
+        _blows(contacts.body, contacts.stripe, self.motion, elastic.impulse, elastic.parting, blow, speed)
         coefficient = self.restitution.of(speed)
-        _repeat(contacts.stripe, blow, parting, coefficient)
+        _repeat(contacts.stripe, blow, elastic.parting, coefficient)
         return coefficient
 
     @cached_property
     def pair(self) -> Ints | None:
         """Labels of the two bodies of each contact, shape (m, 2); None where nothing lies."""
+        # A coefficient of a blow is zero where nothing parts, which is not to lie.
         lies = not self.restitution.by_blow and (self.coefficient == 0.0).any()
         return labels_of(self.contacts, self.label) if lies else None
 
@@ -316,13 +318,11 @@ class Streamed:
 
 def _predict(impact: Impact, start: Floats, target: Floats) -> tuple[int, Status]:
     """Form of QCE's answer the first guess of λ and the velocity to reach; returns its iterations."""
-    contacts, elastic = impact.contacts, impact.elastic
-    least = _aim(
-        contacts.normal, contacts.body, contacts.stripe, elastic.V, impact.coefficient, elastic.impulse, start, target
-    )
+    elastic = impact.elastic
+    _aim(impact.contacts.stripe, impact.coefficient, elastic.impulse, elastic.parting, start, target)
     if elastic.stalled:
         return elastic.iterations, Status.STALLED
-    approaches = least < -QCE_TOLERANCE * impact.speed
+    approaches = elastic.parting.min(initial=0.0) < -QCE_TOLERANCE * impact.speed
     return elastic.iterations, Status.ITERATION_LIMIT if approaches else Status.CONVERGED
 
 
@@ -360,30 +360,15 @@ def _without_spin(motion: Floats, V: Floats) -> None:
                 V[b, column] = motion[b, column]
 
 
-@kernel
-def _blow_stripe(
-    normal: Floats, body: Indices, V: Floats, begin: int, end: int, impulse: Floats, blow: Floats, parting: Floats,
-    speed: Floats,
-) -> None:  # fmt: skip
-    """As `_blows`, for some contacts."""
-    for i in range(np.uint64(begin), np.uint64(end)):
-        a = body[i, 0]
-        b = body[i, 1]
-        parting[i] = (
-            normal[i, 0] * (V[b, 0] - V[a, 0]) + normal[i, 1] * (V[b, 1] - V[a, 1]) + normal[i, 2] * (V[b, 2] - V[a, 2])
-        )
-        blow[i] = 0.5 * (V[a, 3] + V[b, 3]) * impulse[i]
-        speed[i] = max(min(blow[i], parting[i]), 0.0)
-
-
 @parallel_kernel
 def _blows(
-    normal: Floats, body: Indices, stripe: Ints, V: Floats, impulse: Floats, blow: Floats, parting: Floats,
-    speed: Floats,
-) -> None:  # fmt: skip
-    """Fill b_i = ½ W_ii λ_i, u_i of velocities V, and the speed b_i / n_i of each collision [m/s], shape (m,)."""
+    body: Indices, stripe: Ints, motion: Floats, impulse: Floats, parting: Floats, blow: Floats, speed: Floats
+) -> None:
+    """Fill b_i = ½ W_ii λ_i and the speed b_i / n_i of each collision of a blow [m/s], shape (m,)."""
     for k in prange(stripe.size - 1):
-        _blow_stripe(normal, body, V, stripe[k], stripe[k + 1], impulse, blow, parting, speed)
+        for i in range(stripe[k], stripe[k + 1]):
+            blow[i] = 0.5 * (motion[body[i, 0], 3] + motion[body[i, 1], 3]) * impulse[i]
+            speed[i] = max(min(blow[i], parting[i]), 0.0)
 
 
 @parallel_kernel
@@ -399,32 +384,12 @@ def _repeat(stripe: Ints, blow: Floats, parting: Floats, coefficient: Floats) ->
                 coefficient[i] = coefficient[i] ** (b / u) if u > 0.0 else 0.0
 
 
-@kernel
-def _aim_stripe(
-    normal: Floats, body: Indices, V: Floats, begin: int, end: int, restitution: Floats, impulse: Floats,
-    start: Floats, target: Floats,
-) -> float:  # fmt: skip
-    """As `_aim`, for some contacts."""
-    least = 0.0
-    for i in range(np.uint64(begin), np.uint64(end)):
-        a = body[i, 0]
-        b = body[i, 1]
-        u = normal[i, 0] * (V[b, 0] - V[a, 0]) + normal[i, 1] * (V[b, 1] - V[a, 1]) + normal[i, 2] * (V[b, 2] - V[a, 2])
-        least = min(least, u)
-        e = restitution[i]
-        target[i] = e * u
-        # (1 + e) / 2 is exact for one contact without friction; what lies has a guess of its own.
-        start[i, 0] += 0.5 * (1.0 + e) * impulse[i] if e > 0.0 else 0.0
-    return least
-
-
 @parallel_kernel
-def _aim(
-    normal: Floats, body: Indices, stripe: Ints, V: Floats, restitution: Floats, impulse: Floats, start: Floats,
-    target: Floats,
-) -> float:  # fmt: skip
-    """Fill the velocity to reach after QCE's answer V, and add to the guess of λ; returns the least velocity of V."""
-    least = np.zeros(stripe.size - 1)
+def _aim(stripe: Ints, coefficient: Floats, impulse: Floats, parting: Floats, start: Floats, target: Floats) -> None:
+    """Fill the velocity to reach after QCE's answer, and add to the guess of λ."""
     for k in prange(stripe.size - 1):
-        least[k] = _aim_stripe(normal, body, V, stripe[k], stripe[k + 1], restitution, impulse, start, target)
-    return float(least.min())
+        for i in range(stripe[k], stripe[k + 1]):
+            e = coefficient[i]
+            target[i] = e * parting[i]
+            # (1 + e) / 2 is exact for one contact without friction; what lies has a guess of its own.
+            start[i, 0] += 0.5 * (1.0 + e) * impulse[i] if e > 0.0 else 0.0
