@@ -14,9 +14,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
+from solvers import _jit
 from solvers._jit import alone, kernel, parallel_kernel, prange
 from solvers.problem import ImpactProblem
 from solvers.solution import Floats
@@ -40,6 +42,28 @@ RUNAWAY = 100.0
 NO_FRICTION = np.zeros(0)
 # A gap that closes after a wait is zero to the rounding of that wait.
 CLOSED = 1e-14
+
+
+class Room(NamedTuple):
+    """Memory of a round."""
+
+    v: Floats
+    """Velocity, and inverse mass of each body; shape of `Spheres.v_pre`."""
+
+    dv: Floats
+    """What the pushes of a step add to the velocities, beside the inverse masses; shape of `Spheres.v_pre`."""
+
+    P: Floats
+    """Impulse, shape (m,)."""
+
+    compression: Floats
+    """δ, shape (m,)."""
+
+    pressing: Indices
+    """Contacts that press, shape (m,)."""
+
+    u_end: Floats
+    """Relative velocity after the round, shape (m,)."""
 
 
 @dataclass(frozen=True)
@@ -74,17 +98,21 @@ class Spheres:
 
     def relative_velocity(self, v: Floats) -> Floats:
         """Relative velocities along the rows at a velocity of the bodies, shape (m,)."""
-        nothing = np.zeros(self.rate.size)
-        return self.outcome(v, v, nothing, nothing, NO_FRICTION)[0]
+        run = _powers if self.chunks.is_shared else _powers_alone
+        u = np.zeros(self.rate.size)
+        # Without impulses there is no energy to ask for.
+        run(self.chunks.begin, self.normal, self.chunks.body, v, u, u, u)
+        return u
 
     def outcome(self, v: Floats, v_end: Floats, u: Floats, P: Floats, P_t: Floats) -> tuple[Floats, float, float]:
         """Relative velocities after impulses that take u to them, and the energy of αP: α a + ½ α² b.
 
         Returns:
-            Relative velocities, shape (m,), a, b.
+            Relative velocities, shape (m,), valid until the next call; a, b.
         """
         run = _powers if self.chunks.is_shared else _powers_alone
-        u_end, power = run(self.chunks.begin, self.normal, self.chunks.body, v_end, P, u)
+        u_end = self.room.u_end
+        power = run(self.chunks.begin, self.normal, self.chunks.body, v_end, P, u, u_end)
         return u_end, float(power[:, 0].sum()), float(power[:, 1].sum())
 
     def in_problem_order(self, v: Floats, P: Floats, *, n: int, V: float, w: float) -> tuple[Floats, Floats]:
@@ -94,9 +122,11 @@ class Spheres:
         return run(v, P, self.rows.owner, self.rows.contact, n, V, V / w)
 
     @cached_property
-    def pushed(self) -> Floats:
-        """Room for what the pushes of a step add to the velocities, beside the inverse masses; shape of `v_pre`."""
-        return self.v_pre.copy()
+    def room(self) -> Room:
+        """Memory of a round, which the next one takes again: fresh memory costs more than what is written to it."""
+        m = self.rate.size
+        v, dv = _copy(self.v_pre), _copy(self.v_pre)
+        return Room(v, dv, np.empty(m), np.empty(m), np.empty(m, np.uint32), np.empty(m))
 
     def integrate(
         self, v: Floats, u: Floats, *, exponent: float, h: float, gap_memory: float, threshold: float, slowest: float,
@@ -105,31 +135,31 @@ class Spheres:
         """One round from v, where the relative velocities are u; gap_memory = 1 remembers nothing.
 
         Returns:
-            Velocity, impulse, friction impulse (none), energy that friction took (0), steps, contact visits, finished.
+            Velocity, impulse, friction impulse (none), energy that friction took (0), steps, contact visits, finished;
+            the arrays are valid until the next round.
         """
-        v = v.copy()
-        P = np.zeros(u.size)
-        compression = np.zeros(u.size)
-        pressing = np.empty(u.size, np.uint32)
-        dv = self.pushed
+        v_end, dv, P, compression, pressing = self.room[:5]
+        v_end[:] = v
+        P[:] = 0.0
+        compression[:] = 0.0
         steps, visits, finished = 0, u.size, False
         if gap_memory < 1.0:
             _clear(0, dv.size // 4, dv)
             run = _sweep if self.chunks.is_shared else _sweep_alone
             steps, visits, finished, n_pressing, h = run(
                 self.chunks.begin, self.chunks.bodies_of_chunk, self.normal, self.chunks.body, self.inertia, exponent,
-                h, gap_memory, threshold, slowest, max_steps, max_visits, v, dv, P, compression, pressing,
+                h, gap_memory, threshold, slowest, max_steps, max_visits, v_end, dv, P, compression, pressing,
             )  # fmt: skip
         else:
             n_pressing = _approaching(u, slowest, pressing)
         if not finished and n_pressing > 0:
             more, seen, finished = _follow(
                 *self.chunks.contacts_of_body, self.normal, self.chunks.body, exponent, h, slowest, max_steps - steps,
-                max_visits - visits, n_pressing, v, dv, P, compression, pressing,
+                max_visits - visits, n_pressing, v_end, dv, P, compression, pressing,
             )  # fmt: skip
             steps += more
             visits += seen
-        return v, P, NO_FRICTION, 0.0, steps, visits, finished
+        return v_end, P, NO_FRICTION, 0.0, steps, visits, finished
 
 
 def spheres(problem: ImpactProblem, *, exponent: float, V: float, w: float) -> Spheres | None:
@@ -194,21 +224,30 @@ _in_problem_order_alone = alone(_in_problem_order)
 @kernel
 def _speed(normal: Floats, body: Indices, i: int | np.uint64, V: Floats) -> float:
     """Relative velocity n · (v_b - v_a) along row i."""
-    a, b = body[TWO * i], body[TWO * i + ONE]
-    return float(
-        normal[THREE * i] * (V[b] - V[a]) + normal[THREE * i + ONE] * (V[b + ONE] - V[a + ONE])
-        + normal[THREE * i + TWO] * (V[b + TWO] - V[a + TWO])
-    )  # fmt: skip
+    return float(_jit.along(normal, THREE * i, V, body[TWO * i], body[TWO * i + ONE]))
+
+
+@kernel
+def _push(normal: Floats, body: Indices, i: np.uint64, kick: float, V: Floats) -> None:
+    """Add what an impulse of contact i does to the velocities of its two bodies; their inverse masses stand in V."""
+    _jit.move(normal, THREE * i, kick, V, body[TWO * i], body[TWO * i + ONE])
+
+
+@kernel
+def _copy(v: Floats) -> Floats:
+    """Copy in memory of compiled code, which begins where a vector register may: no row lies across two cache lines."""
+    return v.copy()
 
 
 @parallel_kernel
-def _powers(chunk: Offsets, normal: Floats, body: Indices, V: Floats, P: Floats, u: Floats) -> tuple[Floats, Floats]:
-    """Relative velocities at V, shape (m,); first and second order of the energy of P by chunk, shape (chunks, 2)."""
-    u_end = np.empty(P.size)
+def _powers(
+    chunk: Offsets, normal: Floats, body: Indices, V: Floats, P: Floats, u: Floats, u_end: Floats
+) -> Floats:  # fmt: skip
+    """Fill in relative velocities at V; returns first and second order of the energy of P, shape (chunks, 2)."""
     power = np.empty((chunk.size - 1, 2))
     for c in prange(chunk.size - 1):
         power[c, 0], power[c, 1] = _powers_of_chunk(chunk[c], chunk[c + 1], normal, body, V, P, u, u_end)
-    return u_end, power
+    return power
 
 
 _powers_alone = alone(_powers)
@@ -239,21 +278,6 @@ def _force(compression: float, exponent: float) -> float:
     if exponent == 1.0:
         return compression
     return float(compression**exponent)
-
-
-@kernel
-def _push(normal: Floats, body: Indices, i: np.uint64, kick: float, V: Floats) -> None:
-    """Add what an impulse of contact i does to the velocities of its two bodies; their inverse masses stand in V."""
-    a, b = body[TWO * i], body[TWO * i + ONE]
-    n0, n1, n2 = normal[THREE * i], normal[THREE * i + ONE], normal[THREE * i + TWO]
-    for_a = kick * V[a + THREE]
-    for_b = kick * V[b + THREE]
-    V[b] += for_b * n0
-    V[b + ONE] += for_b * n1
-    V[b + TWO] += for_b * n2
-    V[a] -= for_a * n0
-    V[a + ONE] -= for_a * n1
-    V[a + TWO] -= for_a * n2
 
 
 @kernel
@@ -305,8 +329,8 @@ def _shift(
     for c in range(begin, end):
         i = np.uint64(pressing[c])
         kick = _shifted(normal, body, i, compression[i], h, exponent, dv)
-        P[i] += kick
         _push(normal, body, i, kick, V)
+        P[i] += kick
 
 
 @kernel
@@ -397,10 +421,9 @@ def _sweep(
                     pressing[n_pressing] = pressing[q]
                     n_pressing += 1
             return steps, visits, False, n_pressing, h
-        if remembers:
-            peak = max(peak, left)
-            h = shortest * (peak / left) ** growth
-            remembers = left >= gap_memory * gap_memory * peak
+        peak = max(peak, left)
+        h = shortest * (peak / left) ** growth
+        remembers = remembers and left >= gap_memory * gap_memory * peak
     return steps, visits, False, 0, h
 
 

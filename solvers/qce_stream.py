@@ -35,8 +35,6 @@ Source: Zhang 2015, Algorithm 1, as corrected in `quadratic_contact_energy`; the
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import numpy.typing as npt
 
@@ -176,15 +174,6 @@ def _end_by_pieces(
 
 
 @kernel
-def _ask(array: npt.NDArray[Any], place: int | np.unsignedinteger[Any]) -> None:
-    """Ask for an entry of a flat array ahead of its turn.
-
-    The one call into another file, whose edits numba's cache does not see: no result depends on it.
-    """
-    _jit.prefetch(array, place)
-
-
-@kernel
 def _sweep(
     begin: int, stop: int, first: int, last: int, due: Indices, load: Floats, start: Indices, neighbor: Indices,
     coupling: Floats, end: Floats, awake: Flags, woken: Indices, count: int,
@@ -199,14 +188,14 @@ def _sweep(
         # Contacts are due in another order than they lie in memory, which is beyond the caches near the core.
         if place + HEAD_AHEAD < size:
             j = due[place + HEAD_AHEAD]
-            _ask(start, j + j)
-            _ask(load, j + j)
+            _jit.prefetch(start, j + j)
+            _jit.prefetch(load, j + j)
         if place + ROW_AHEAD < size:
             j = due[place + ROW_AHEAD]
-            _ask(end, j)
-            _ask(neighbor, start[j, 0])
-            _ask(coupling, start[j, 0])
-            _ask(coupling, start[j, 0] + LINE)
+            _jit.prefetch(end, j)
+            _jit.prefetch(neighbor, start[j, 0])
+            _jit.prefetch(coupling, start[j, 0])
+            _jit.prefetch(coupling, start[j, 0] + LINE)
         k = due[place]
         before = end[k]
         row, row_stop = start[k, 0], start[k, 1]

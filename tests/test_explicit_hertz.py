@@ -330,6 +330,25 @@ def test_packed_spheres_agree_with_the_general_path(start: str) -> None:
     assert np.sqrt(np.mean((packed.v_post - general.v_post[:-1]) ** 2)) < PATHS_APART
 
 
+@pytest.mark.kernels
+@pytest.mark.parametrize("kick", [0.3, np.inf, np.nan])
+def test_rows_in_vector_registers_are_the_sums_written_out(kick: float) -> None:
+    random = np.random.default_rng(5)
+    normal, V = random.normal(size=(4, 3)), random.normal(size=(6, 4))
+    # Bodies that stand beside one another and not, in either order, and the last row of every array.
+    for i, (a, b) in enumerate([(0, 1), (4, 1), (2, 5), (5, 4)]):
+        body = np.zeros(8, np.uint32)
+        body[2 * i : 2 * i + 2] = 4 * a, 4 * b
+        along = normal[i] * (V[b, :3] - V[a, :3])
+        speed = explicit_hertz_spheres._speed(normal.ravel(), body, np.uint64(i), V.ravel())
+        assert speed == along[0] + along[1] + along[2]
+        pushed, expected = V.ravel().copy(), V.copy()
+        expected[a, :3] -= kick * V[a, 3] * normal[i]
+        expected[b, :3] += kick * V[b, 3] * normal[i]
+        explicit_hertz_spheres._push(normal.ravel(), body, np.uint64(i), kick, pushed)
+        np.testing.assert_array_equal(pushed.reshape(6, 4), expected)
+
+
 def test_the_step_of_packed_spheres_grows_as_speeds_fall() -> None:
     problem = sphere_pack(spheres=300, start="hot").problem
     packed, general = ExplicitHertz().solve(problem), ExplicitHertz().solve(with_an_idle_velocity(problem))
