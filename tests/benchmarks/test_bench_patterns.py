@@ -15,7 +15,7 @@ from scenarios.granular import PUBLISHED, extended_pattern
 pytestmark = pytest.mark.long
 
 
-@pytest.mark.parametrize(("pattern", "side", "cycles"), [("hexagons", 50, 20), ("squares", 67, 10)])
+@pytest.mark.parametrize(("pattern", "side", "cycles"), [("hexagons", 50, 40), ("squares", 67, 10)])
 def test_a_smaller_box_shows_the_published_wavelength(benchmark: Any, pattern: str, side: int, cycles: int) -> None:
     scene = extended_pattern(pattern=pattern, side=side)
     world = scene.world()
