@@ -16,6 +16,22 @@ import numpy.typing as npt
 SMALLEST = 1 << 22
 
 
+# Bytes of a line of the cache.
+LINE = 64
+
+
+def on_lines(shape: tuple[int, ...], dtype: npt.DTypeLike = np.float64) -> npt.NDArray[Any]:
+    """Array of undefined content that begins with a line of the cache: rows of 32 or 64 bytes lie within one line each.
+
+    Numpy's own begin 16 bytes later, so that every other row of 32 bytes, and every row of 64, lies across two.
+    """
+    entry = np.dtype(dtype)
+    size = prod(shape) * entry.itemsize
+    memory = np.empty(size + LINE, np.uint8)
+    begin = -memory.ctypes.data % LINE
+    return memory[begin : begin + size].view(entry).reshape(shape)
+
+
 class Buffers:
     """Memory of one owner that calls the same functions again and again, one call at a time."""
 
@@ -34,6 +50,6 @@ class Buffers:
         kept = self._kept.get(name)
         if kept is None or kept.size < size:
             entry = np.dtype(dtype)
-            kept = np.empty(max(size + size // 4, SMALLEST // entry.itemsize), entry)
+            kept = on_lines((max(size + size // 4, SMALLEST // entry.itemsize),), entry)
             self._kept[name] = kept
         return kept[:size].reshape(shape)

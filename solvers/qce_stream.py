@@ -81,7 +81,7 @@ SEARCH_ALL = 24
 SPARE_SWEEPS = 100
 
 # From this many contacts on sharing the work out pays: below it threads wait for one another most of the time.
-SHARED_CONTACTS = 30_000
+SHARED_CONTACTS = 15_000
 ONE = np.uint32(1)
 
 STALLED = 1

@@ -29,7 +29,7 @@ Indices = npt.NDArray[np.uint32]
 Offsets = npt.NDArray[np.uint64]
 
 # From this many contacts on sharing the work out pays: below it threads wait for one another most of the time.
-SHARED_CONTACTS = 30_000
+SHARED_CONTACTS = 15_000
 # Chunks of contacts that threads share out; the same for any number of threads.
 MOST_CHUNKS = 64
 # Numba makes a signed index of an unsigned one and a plain number, and tests it for being negative at every access.

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from solvers import ProblemError
+from solvers.buffers import on_lines
 from solvers.solution import Floats
 
 Ints = npt.NDArray[np.int32]
@@ -85,7 +86,7 @@ class Spheres:
 
     def renumber(self, order: Ints) -> None:
         """Let the sphere that was number `order[k]` be number k; shape (bodies,)."""
-        self.place = self.place[order]
+        self.place[:] = self.place[order]
         self.motion[:-1] = self.motion[order]
         self.label = self.label[order]
 
@@ -107,8 +108,8 @@ def spheres(
     centers = np.array(position, dtype=np.float64)
     if centers.ndim != 2 or centers.shape[1] != 3 or not len(centers):
         raise ProblemError(f"position must have shape (bodies, 3) with at least one body, not {centers.shape}")
-    place = np.empty((len(centers), 4))
-    motion = np.zeros((len(centers) + 1, 8))
+    place, motion = on_lines((len(centers), 4)), on_lines((len(centers) + 1, 8))
+    motion[:] = 0.0
     place[:, :3] = _finite("position", centers)
     place[:, 3] = _positive("radius", radius, len(centers))
     motion[:-1, 3] = 1.0 / _positive("mass", mass, len(centers))

@@ -34,7 +34,7 @@ from scenarios.world.spheres import INVERSE_INERTIA, PARTS, Ints, Spheres
 from scenarios.world.warm_start import NO_IMPULSES, LastImpulses
 from solvers import ImpactProblem, ProblemError, Status
 from solvers._jit import kernel, parallel_kernel, prange
-from solvers.buffers import Buffers
+from solvers.buffers import Buffers, on_lines
 from solvers.solution import Floats
 
 Counts = npt.NDArray[np.int64]
@@ -149,7 +149,8 @@ class World:
     def __post_init__(self) -> None:
         self._last = NO_IMPULSES
         self._buffers = Buffers()
-        self._spare_motion, self._spare_place = np.empty_like(self.spheres.motion), np.empty_like(self.spheres.place)
+        motion, place = self.spheres.motion, self.spheres.place
+        self._spare_motion, self._spare_place = on_lines(motion.shape), on_lines(place.shape)
         self._smallest = float(self.spheres.radius.min())
         self._sums = self._sums_now()
         self._numbered = 0
