@@ -152,10 +152,10 @@ class ExplicitHertz:
 
     def _bounce(self, contacts: Rows | Spheres, threshold: float) -> _Run:
         """Elastic rounds until nothing approaches."""
-        impulse = np.zeros(contacts.rate.size)
         v = contacts.v_pre.copy()
-        friction_impulse = np.zeros(contacts.friction_rows)
         u = contacts.relative_velocity(v)
+        impulse = np.zeros(u.size)
+        friction_impulse = np.zeros(contacts.friction_rows)
         u_min = float(u.min())
         gap_memory = self.gap_memory
         refinement = 1.0
@@ -211,7 +211,7 @@ class ExplicitHertz:
         """Shortest step of a round whose fastest approach is V."""
         a = 1.0 / (self.exponent + 1.0)
         pair = pair_duration(self.exponent) * (0.5 * (self.exponent + 1.0)) ** a / self.steps_per_contact
-        return float(pair * contacts.rate.max() ** -a * V ** (1.0 - 2.0 * self.exponent * a))
+        return float(pair * contacts.highest_rate ** -a * V ** (1.0 - 2.0 * self.exponent * a))
 
 
 class _Run(NamedTuple):

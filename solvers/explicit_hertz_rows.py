@@ -65,6 +65,11 @@ class Rows:
     """Σ_j ‖D_i M⁻¹ D_jᵀ‖ over w, shape (m,): no turn of the tangents or of the axes changes it."""
 
     @property
+    def highest_rate(self) -> float:
+        """Largest (W K W)_ii / W_ii over w."""
+        return float(self.rate.max())
+
+    @property
     def friction_rows(self) -> int:
         """Number of friction directions."""
         return int(self.D.shape[0])

@@ -85,8 +85,8 @@ class Spheres:
     scale: Floats | None
     """k^(1/(η+1)), shape (m,), 1 at the softest contact; None where all are 1."""
 
-    rate: Floats
-    """(W K W)_ii / W_ii, shape (m,)."""
+    highest_rate: float
+    """Largest (W K W)_ii / W_ii."""
 
     inertia: float
     """Mass by which approach counts as energy: 1 over the mean rate."""
@@ -99,7 +99,7 @@ class Spheres:
     def relative_velocity(self, v: Floats) -> Floats:
         """Relative velocities along the rows at a velocity of the bodies, shape (m,)."""
         run = _powers if self.chunks.is_shared else _powers_alone
-        u = np.zeros(self.rate.size)
+        u = np.zeros(self.rows.contact.size)
         # Without impulses there is no energy to ask for.
         run(self.chunks.begin, self.normal, self.chunks.body, v, u, u, u)
         return u
@@ -124,7 +124,7 @@ class Spheres:
     @cached_property
     def room(self) -> Room:
         """Memory of a round, which the next one takes again: fresh memory costs more than what is written to it."""
-        m = self.rate.size
+        m = self.rows.contact.size
         v, dv = _copy(self.v_pre), _copy(self.v_pre)
         return Room(v, dv, np.empty(m), np.empty(m), np.empty(m, np.uint32), np.empty(m))
 
@@ -173,16 +173,16 @@ def spheres(problem: ImpactProblem, *, exponent: float, V: float, w: float) -> S
     softest = float(problem.stiffness.min())
     # In units of the softest: no row is shorter than its normal, so that none approaches faster than its row says.
     if softest == problem.stiffness.max():
-        scale, rate = None, chunks.rates_of_equals / w
+        scale, rates = None, chunks.rates_of_equals
     else:
         stiffness = problem.stiffness[rows.contact] / softest
-        scale, rate = stiffness ** (1.0 / (exponent + 1.0)), chunks.rates(stiffness) / w
-    if (rate.max() / rate.min()) ** (1.0 / (exponent + 1.0)) > PACKED_SPREAD:
+        scale, rates = stiffness ** (1.0 / (exponent + 1.0)), chunks.rates(stiffness)
+    if (rates.highest / rates.lowest) ** (1.0 / (exponent + 1.0)) > PACKED_SPREAD:
         return None
     normal = chunks.normal if scale is None else (rows.normal * scale[:, None]).reshape(-1)
     # A kernel is compiled for one kind of array.
     normal.flags.writeable = False
-    return Spheres(rows, chunks, v_pre, normal, scale, rate, 1.0 / float(rate.mean()))
+    return Spheres(rows, chunks, v_pre, normal, scale, rates.highest / w, w / rates.mean)
 
 
 @parallel_kernel

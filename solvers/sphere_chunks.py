@@ -5,7 +5,7 @@
 Chunks of one parity share no movable body: threads take those of even number, then those of odd number, and what a body
 sums up has one order whoever does it. A contact lasts as its own rate says (see `explicit_hertz`).
 
-A problem keeps all this beside its packed rows, 24 bytes a contact and 36 a body: it is made once, by the first solve
+A problem keeps all this beside its packed rows, 16 bytes a contact and 36 a body: it is made once, by the first solve
 that asks for it.
 """
 
@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -34,6 +34,14 @@ SHARED_CONTACTS = 15_000
 MOST_CHUNKS = 64
 # Numba makes a signed index of an unsigned one and a plain number, and tests it for being negative at every access.
 ONE, TWO, THREE, FOUR, FIVE = np.uint64(1), np.uint64(2), np.uint64(3), np.uint64(4), np.uint64(5)
+
+
+class Rates(NamedTuple):
+    """Rates of all contacts in short [1/kg]."""
+
+    lowest: float
+    mean: float
+    highest: float
 
 
 @dataclass(frozen=True)
@@ -60,13 +68,14 @@ class SphereChunks:
         """Whether threads share the work out."""
         return self.body.size >= 2 * SHARED_CONTACTS
 
-    def rates(self, stiffness: Floats) -> Floats:
-        """(W K W)_ii / W_ii [1/kg], shape (m,), at a stiffness of shape (m,)."""
+    def rates(self, stiffness: Floats) -> Rates:
+        """(W K W)_ii / W_ii [1/kg] at a stiffness of shape (m,)."""
         run = _rates if self.is_shared else _rates_alone
-        return run(self.begin, self.normal, self.body, self.at_rest, stiffness)
+        rate = run(self.begin, self.normal, self.body, self.at_rest, stiffness)
+        return Rates(float(rate.min()), float(rate.mean()), float(rate.max()))
 
     @cached_property
-    def rates_of_equals(self) -> Floats:
+    def rates_of_equals(self) -> Rates:
         """`rates` where every stiffness is 1."""
         return self.rates(np.ones(self.body.size // 2))
 

@@ -109,7 +109,8 @@ def time_of_chunks(problem: ImpactProblem, clock: Callable[[], float]) -> float:
     assert problem.spheres_at_rest is not None
     start = clock()
     made = chunks(problem.spheres_at_rest)
-    assert made.rates_of_equals.size == problem.m <= made.contacts_of_body[1].size
+    assert made.rates_of_equals.highest > 0.0
+    assert made.contacts_of_body[1].size >= problem.m
     return clock() - start
 
 
