@@ -211,7 +211,7 @@ class ExplicitHertz:
         """Shortest step of a round whose fastest approach is V."""
         a = 1.0 / (self.exponent + 1.0)
         pair = pair_duration(self.exponent) * (0.5 * (self.exponent + 1.0)) ** a / self.steps_per_contact
-        return float(pair * contacts.highest_rate ** -a * V ** (1.0 - 2.0 * self.exponent * a))
+        return float(pair * contacts.highest_rate**-a * V ** (1.0 - 2.0 * self.exponent * a))
 
 
 class _Run(NamedTuple):

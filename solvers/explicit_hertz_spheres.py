@@ -33,6 +33,8 @@ PACKED_CONTACTS = 300
 LAYERED = 2
 # Packed spheres share one step: the longest may be this many times the shortest.
 PACKED_SPREAD = 4.0
+# Blocks of chunks that threads share out; the same for any number of threads.
+BLOCKS = 4
 # A pressing contact pushes two bodies, which take part in five others each: with fewer pressing than one in so many,
 # contacts of pushed bodies are fewer than half of all.
 SPARSE = 24
@@ -373,6 +375,13 @@ def _sweep(
     """
     m = P.size
     chunks = chunk.size - 1
+    bodies = np.uint64(size)
+    # Threads share blocks of chunks out. Of each, the last chunk presses first: it reaches into the next block. The
+    # others follow in their order, and one pushes as soon as the next has pressed, while both are in the cache.
+    blocks = min(BLOCKS, max(chunks // 2, 1))
+    block = np.empty(blocks + 1, np.uint64)
+    for b in range(blocks + 1):
+        block[b] = b * chunks // blocks
     # Where the lists of the chunks end.
     end = chunk.copy()
     left_in = np.zeros(chunks)
@@ -385,13 +394,28 @@ def _sweep(
     visits = 0
     while steps < max_steps and visits < max_visits:
         steps += 1
-        for parity in range(2):
-            for half in prange((chunks + 1 - parity) // 2):
-                c = 2 * half + parity
-                left_in[c], end[c] = _press(
-                    chunk[c], chunk[c + 1], normal, body, inertia, exponent, h, remembers, slowest,
-                    V, compression, pressing, dv,
-                )  # fmt: skip
+        for b in prange(blocks):
+            c = block[b + 1] - ONE
+            left_in[c], end[c] = _press(
+                chunk[c], chunk[c + ONE], normal, body, inertia, exponent, h, remembers, slowest,
+                V, compression, pressing, dv,
+            )  # fmt: skip
+        for b in prange(blocks):
+            for c in range(block[b], block[b + 1]):
+                if c + ONE < block[b + 1]:
+                    left_in[c], end[c] = _press(
+                        chunk[c], chunk[c + ONE], normal, body, inertia, exponent, h, remembers, slowest,
+                        V, compression, pressing, dv,
+                    )  # fmt: skip
+                if c > block[b]:
+                    _shift(chunk[c - ONE], end[c - ONE], normal, body, exponent, h, compression, pressing, dv, V, P)
+                    # The bodies that a block begins with are read by the last chunk before it.
+                    if c - ONE > block[b] or b == 0:
+                        _clear((c - ONE) * bodies, c * bodies, dv)
+        for b in prange(blocks):
+            c = block[b + 1] - ONE
+            _shift(chunk[c], end[c], normal, body, exponent, h, compression, pressing, dv, V, P)
+            _clear(c * bodies, (c + TWO) * bodies, dv)
         left = 0.0
         n_pressing = 0
         for c in range(chunks):
@@ -405,15 +429,6 @@ def _sweep(
                 return steps, visits, True, 0, h
             visits += m
             continue
-        for parity in range(2):
-            for half in prange((chunks + 1 - parity) // 2):
-                c = 2 * half + parity
-                _shift(chunk[c], end[c], normal, body, exponent, h, compression, pressing, dv, V, P)
-                # Chunks read the bodies of their own and of the next: the odd ones are the last to.
-                if parity == 1:
-                    _clear(c * size, (c + 2) * size, dv)
-                elif c == 0:
-                    _clear(0, size, dv)
         if not remembers and SPARSE * n_pressing < m:
             n_pressing = 0
             for c in range(chunks):

@@ -24,13 +24,16 @@ from solvers._jit import kernel
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 
+# Semi-implicit Euler is of first order: with so many steps the two closed forms of `test_landing.py` hold to 5e-3.
 STEPS_A_CONTACT = 25
-# The damper of the slip ends it in this share of a contact.
+# The damper ends a slip in this share of a contact, two steps: shorter, it would turn the slip round at every step.
 SLIP = 1.0 / 15.0
 # Pairs nearer than this between their surfaces are listed [D].
 SKIN = 0.25
+# The plate, and two sides along each horizontal axis.
 WALLS = 5
-# Inverse moment of inertia of a solid sphere over its inverse mass, for spin times radius; and what a slip has of it.
+# m r² / I of a solid sphere. An impulse P along its surface changes the velocity by P/m, and spin times radius by
+# TURN P/m; the surface moves with both.
 TURN = 2.5
 
 
@@ -45,13 +48,19 @@ class SoftLayer:
     restitution: float | None = None
     """e; None: max(1 - 0.3 v^(3/4), 0.7)."""
     friction: float = 0.5
+    """Coefficient of all contacts."""
     time: float = 0.0
+    """[√(D/g)]."""
     place: Floats = field(init=False)
+    """Centers [D], shape (grains, 3)."""
     velocity: Floats = field(init=False)
+    """[√(gD)], in the plate's frame, shape (grains, 3)."""
     spin: Floats = field(init=False)
-    """ω times the radius."""
+    """ω times the radius [√(gD)], shape (grains, 3)."""
     mass: Floats = field(init=False)
+    """In mean masses, shape (grains,)."""
     radius: Floats = field(init=False)
+    """[D], shape (grains,)."""
 
     def __post_init__(self) -> None:
         start = extended_pattern(pattern=self.pattern, side=self.side).world(solver="qce-lcp-fast", seed=0).spheres
@@ -181,7 +190,7 @@ def _go(
                 t[axis] = v[axis] - normal_speed * n[axis] - cross
                 slipping += t[axis] ** 2
             slipping = np.sqrt(slipping)
-            # Seven halves of the inverse masses resist a slip.
+            # An impulse along the surfaces ends 1 + TURN times the inverse masses of slip.
             resisting = 1.0 / ((1.0 + TURN) * (1.0 / mass[b] + (1.0 / mass[a] if pair else 0.0)))
             rub = min(friction * press, resisting / slip * slipping)
             for axis in range(3):
