@@ -16,8 +16,8 @@ from llvmlite import ir  # type: ignore[import-untyped]
 from numba.extending import intrinsic, overload
 
 # Threads of OpenMP that wait for each other by spinning take the cores from one another as soon as other processes
-# are at work: a sweep of a millisecond then takes tens of them. Those that sleep at once take 10 µs to wake up, at each
-# of the hundreds of loops of an impact. So they spin for some µs, and then sleep. Read when the first thread starts.
+# are at work: a sweep of a millisecond then takes tens of them. Those that sleep at once take as long to wake up as
+# many a loop lasts, and an impact has hundreds. So they spin a little, then sleep. Read when the first thread starts.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 os.environ.setdefault("GOMP_SPINCOUNT", "3000")
 
@@ -29,8 +29,6 @@ EDITION = f"{zlib.crc32(Path(__file__).read_bytes()):08x}"
 
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
-
-
 Floats = npt.NDArray[np.float64]
 Place = int | np.unsignedinteger[Any]
 

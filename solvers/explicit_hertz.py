@@ -60,7 +60,7 @@ Tried and left, each by a prototype that lost: implicit midpoint, its force at t
 (several times the visits at the same error, and no solution in large steps); the energy of each contact as its state
 in place of δ (every kick that overdraws an account ends its contact); leapfrog (one more pass over the pressing
 contacts costs less); two unequal drifts (McLachlan); explicit multistep (Störmer of order 3 and 4: large α - 1); a
-shift by the own W_ii F_i alone (a shift with 1/13 in place of 1/12 has a fifth less error at coarse steps and more at
+shift by the own W_ii F_i alone (a shift with 1/13 in place of 1/12 has less error at coarse steps and more at
 fine ones); normals and compressions of spheres in single precision; signed indices.
 """
 
