@@ -37,8 +37,8 @@ LONGEST_STEP = 0.0155
 """Time step of the patterns [√(D/g)]: 396 a cycle for hexagons, 557 for squares.
 
 A layer that lands is pressed together, the more the longer the step: `tests/benchmarks/test_bench_world.py` prints the
-deepest overlap of a step and of half of it, `tests/test_landing.py` what a quarter of it changes in a landing. Zhang 2015 has 0.0002 s; with grains of 0.165 mm, as in the experiments of
-Bizon 1998, that were 0.049.
+deepest overlap of a step and of half of it, `tests/test_landing.py` what a quarter of it changes in a landing. Zhang
+2015 has 0.0002 s; with grains of 0.165 mm, as in the experiments of Bizon 1998, that were 0.049.
 """
 # Cycles between two frames of a pattern, 60,000 grains each; its measures are taken every cycle.
 FRAME_CYCLES = 10
