@@ -91,7 +91,7 @@ def along(normal: Floats, row: Place, V: Floats, a: Place, b: Place) -> float:
     """Relative velocity n · (v_b - v_a) in a kernel, by vector registers.
 
     A body is a row of four numbers, which such a register holds; numba's compiler takes them one by one. Rows are read
-    fastest from arrays that compiled code has allocated: there none lies across two lines of the cache.
+    fastest from arrays that begin with a line of the cache (`buffers.on_lines`).
 
     Args:
         normal: flat, in groups of three.

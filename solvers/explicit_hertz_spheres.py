@@ -20,6 +20,7 @@ import numpy as np
 
 from solvers import _jit
 from solvers._jit import alone, kernel, parallel_kernel, prange
+from solvers.buffers import on_lines
 from solvers.problem import ImpactProblem
 from solvers.solution import Floats
 from solvers.sphere_chunks import FOUR, ONE, THREE, TWO, Indices, Offsets, SphereChunks
@@ -33,7 +34,8 @@ PACKED_CONTACTS = 300
 LAYERED = 2
 # Packed spheres share one step: the longest may be this many times the shortest.
 PACKED_SPREAD = 4.0
-# Blocks of chunks that threads share out; the same for any number of threads.
+# Blocks of chunks that threads share out; the same for any number of threads. They keep two threads busy. More would
+# serve more, but a chunk at the end of a block is read twice a step.
 BLOCKS = 4
 # A pressing contact pushes two bodies, which take part in five others each: with fewer pressing than one in so many,
 # contacts of pushed bodies are fewer than half of all.
@@ -127,7 +129,8 @@ class Spheres:
     def room(self) -> Room:
         """Memory of a round, which the next one takes again: fresh memory costs more than what is written to it."""
         m = self.rows.contact.size
-        v, dv = _copy(self.v_pre), _copy(self.v_pre)
+        v, dv = on_lines(self.v_pre.shape), on_lines(self.v_pre.shape)
+        dv[:] = self.v_pre
         return Room(v, dv, np.empty(m), np.empty(m), np.empty(m, np.uint32), np.empty(m))
 
     def integrate(
@@ -233,12 +236,6 @@ def _speed(normal: Floats, body: Indices, i: int | np.uint64, V: Floats) -> floa
 def _push(normal: Floats, body: Indices, i: np.uint64, kick: float, V: Floats) -> None:
     """Add what an impulse of contact i does to the velocities of its two bodies; their inverse masses stand in V."""
     _jit.move(normal, THREE * i, kick, V, body[TWO * i], body[TWO * i + ONE])
-
-
-@kernel
-def _copy(v: Floats) -> Floats:
-    """Copy in memory of compiled code, which begins where a vector register may: no row lies across two cache lines."""
-    return v.copy()
 
 
 @parallel_kernel

@@ -20,6 +20,14 @@ from tests.soft_spheres import SoftLayer, fluctuation
 # one cycle and softly in the next.
 SIDE = 20
 LANDINGS = [("flat", 3), ("flat", 4), ("hexagons", 3), ("hexagons", 4), ("squares", 3), ("squares", 4)]
+# How near a landing is to come to that of soft spheres, and what does not come as near at the step of the patterns.
+BOUNDS = {"energy": 0.15, "height": 0.2, "speed": 0.05}
+MISSED = {
+    ("hexagons", 3): {"energy"},
+    ("hexagons", 4): {"height"},
+    ("squares", 3): {"speed"},
+    ("squares", 4): {"speed"},
+}
 # Contacts of 0.005 √(D/g): the grains overlap by 0.01 D.
 STIFFNESS = 200_000.0
 # Of the flat control: 15,000 grains.
@@ -83,14 +91,18 @@ def test_a_layer_lands_as_soft_spheres_do(pattern: str, before: int) -> None:
         found[name, finer] = fluctuation(spheres.velocity, mass), *vertical(spheres.position, spheres.velocity, mass)
         numbers = "{:.4f}  {:6.3f}  {:6.3f}".format(*found[name, finer])
         print(f"  e of {name:8s} {round(world.period / world.settings.step):5d} steps     {numbers}")
-    assert apart(found["blows", 1], expected) < 0.3
-    assert apart(found["blows", 1], expected) < 0.5 * apart(found["approach", 1], expected)
+    blows, approach = (apart(found[name, 1], expected) for name in ("blows", "approach"))
+    assert {name for name, bound in BOUNDS.items() if blows[name] > bound} <= MISSED.get((pattern, before), set())
+    assert max(blows.values()) < 0.3
+    assert max(blows.values()) < 0.5 * max(approach.values())
+    if before == 4:
+        assert all(blows[name] < approach[name] for name in BOUNDS)
 
 
-def apart(found: tuple[float, ...], expected: tuple[float, ...]) -> float:
-    """The largest of the energies' relative difference and those of height [D] and speed [√(gD)]."""
+def apart(found: tuple[float, ...], expected: tuple[float, ...]) -> dict[str, float]:
+    """The energies' relative difference, and those of height [D] and speed [√(gD)]."""
     energy, height, speed = (abs(a - b) for a, b in zip(found, expected, strict=True))
-    return max(energy / expected[0], height, speed)
+    return {"energy": energy / expected[0], "height": height, "speed": speed}
 
 
 @pytest.mark.long

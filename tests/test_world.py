@@ -228,7 +228,7 @@ def test_the_ledger_closes_and_nothing_but_shaking_adds_energy(
 ) -> None:
     world = shaken(Streamed(300, 1e-9), friction=friction, restitution=restitution)
     scale = energy(world.spheres, 1.0)
-    touched = 0
+    touched = gained = 0
     for _ in range(250):
         before = energy(world.spheres, 1.0)
         report = world.step()
@@ -239,11 +239,11 @@ def test_the_ledger_closes_and_nothing_but_shaking_adds_energy(
         assert ledger.kinetic + ledger.potential == pytest.approx(before + change, rel=ROUNDING)
         assert ledger.impact <= 1e-9 * scale
         assert ledger.impact + ledger.friction <= 1e-9 * scale
-        # Friction resists the sliding after an impact: where its other blows turn the sliding round, its work on the
-        # mean of both is positive. With e(v) that happens here once.
-        if restitution == 0.3:
-            assert ledger.friction <= 1e-9 * scale
+        gained += ledger.friction > 1e-9 * scale
         touched += report.contacts
+    # Friction resists the sliding after an impact: where its other blows turn the sliding round, its work on the mean
+    # of both is positive. With e(v) that happens here once, at the 233rd step.
+    assert gained <= (0 if restitution == 0.3 or friction == 0.0 else 1)
     assert touched > 1000
 
 
