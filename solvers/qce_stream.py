@@ -80,8 +80,10 @@ SEARCH_ALL = 24
 # Rounding can make tied contacts wake each other for ever; no problem met here needed 100 sweeps beyond its contacts.
 SPARE_SWEEPS = 100
 
-# From this many contacts on sharing the work out pays: below it threads wait for one another most of the time.
+# From this many contacts on sharing a search out pays, and from this many active ones on an outer iteration: below it
+# threads wait for one another most of the time.
 SHARED_CONTACTS = 15_000
+SHARED_ACTIVE = 2_000
 ONE = np.uint32(1)
 
 STALLED = 1
@@ -104,8 +106,7 @@ def solve_spheres(
         impulse [N s] in the order of `rows`, shape (m,); outer iterations; contact visits; 0, STALLED or RESTLESS.
     """
     strip = _strips(rows)
-    run = _solve_spheres if strip.size > 2 else _solve_spheres_alone
-    return run(rows.normal, rows.body, rows.V, strip, threshold, defer, max_iterations, max_visits)
+    return _solve_spheres(rows.normal, rows.body, rows.V, strip, threshold, defer, max_iterations, max_visits)
 
 
 def _strips(rows: SphereRows) -> Ints:
@@ -599,6 +600,64 @@ def _settle_strip(
 
 
 @parallel_kernel
+def _list_strips(
+    strip: Ints, normal: Floats, body: Indices, V: Floats, threshold: float, found: Indices, F: Floats, span: Indices,
+    member: Indices, near: Floats, pair: Indices, end: Floats, awake: Flags, defer: float, size: Counts, met: Counts,
+) -> None:  # fmt: skip
+    """Search all strips; fill how many contacts approach.
+
+    Pack them, and fill the couplings that they met (see `_enlist`), but where some are to be deferred.
+    """
+    strips = size.size
+    for parity in range(2):
+        for half in prange((strips + 1 - parity) // 2):
+            c = int(2 * np.int64(half) + parity)
+            if defer == 0.0:
+                size[c], met[c] = _list_strip(
+                    strip[c], strip[c + 1], normal, body, V, threshold, found, F, span, member, near, pair, end, awake
+                )  # fmt: skip
+            else:
+                listed = _search(strip[c], strip[c + 1], strip[c], normal, body, V, threshold, found, F)
+                size[c] = listed - strip[c]
+
+
+@parallel_kernel
+def _settle_strips(
+    strip: Ints, size: Counts, place: Offsets, near: Floats, pair: Indices, V: Floats, span: Indices, member: Indices,
+    load: Floats, guess: Floats, start: Indices, neighbor: Indices, coupling: Floats, end: Floats, awake: Flags,
+    order: Indices, woken: Indices, again: Indices, key: Indices, first_key: Indices, evaluated: Counts,
+) -> None:  # fmt: skip
+    """Couple and evaluate the active contacts of all strips; fill the numbers of evaluations."""
+    strips = size.size
+    for parity in range(2):
+        for half in prange((strips + 1 - parity) // 2):
+            c = int(2 * np.int64(half) + parity)
+            stop = strip[c] + size[c]
+            evaluated[c] = _settle_strip(
+                strip[c], stop, place[c], near, pair, V, span, member, load, guess, start, neighbor, coupling,
+                end, awake, order[strip[c] : stop], woken[strip[c] : stop], again[strip[c] : stop], key, first_key[c],
+            )  # fmt: skip
+
+
+@parallel_kernel
+def _apply_strips(
+    strip: Ints, size: Counts, found: Indices, near: Floats, end: Floats, pair: Indices, V: Floats, span: Indices,
+    impulse: Floats,
+) -> None:  # fmt: skip
+    """Apply the impulses of one outer iteration in all strips."""
+    strips = size.size
+    for parity in range(2):
+        for half in prange((strips + 1 - parity) // 2):
+            c = int(2 * np.int64(half) + parity)
+            _apply(strip[c], strip[c] + size[c], found, near, end, pair, V, span, impulse)
+
+
+_list_strips_alone = alone(_list_strips)
+_settle_strips_alone = alone(_settle_strips)
+_apply_strips_alone = alone(_apply_strips)
+
+
+@kernel
 def _solve_spheres(
     normal: Floats, body: Indices, V: Floats, strip: Ints,
     threshold: float, defer: float, max_iterations: int, max_visits: int,
@@ -642,17 +701,14 @@ def _solve_spheres(
     while iterations < max_iterations and visits < max_visits:
         if everywhere:
             visits += m
-            for parity in range(2):
-                for half in prange((strips + 1 - parity) // 2):
-                    c = int(2 * np.int64(half) + parity)
-                    if defer == 0.0:
-                        size[c], met[c] = _list_strip(
-                            strip[c], strip[c + 1], normal, body, V, threshold, found, F,
-                            span, member, near, pair, end, awake,
-                        )  # fmt: skip
-                    else:
-                        listed = _search(strip[c], strip[c + 1], strip[c], normal, body, V, threshold, found, F)
-                        size[c] = listed - strip[c]
+            if strips > 1:
+                _list_strips(
+                    strip, normal, body, V, threshold, found, F, span, member, near, pair, end, awake, defer, size, met
+                )  # fmt: skip
+            else:
+                _list_strips_alone(
+                    strip, normal, body, V, threshold, found, F, span, member, near, pair, end, awake, defer, size, met
+                )  # fmt: skip
         else:
             if seen.size == 0:
                 contact_of = _contacts_of_bodies(body, span)
@@ -677,21 +733,24 @@ def _solve_spheres(
                         strip[c], strip[c] + size[c], found, F, normal, body, V, span, member, near, pair, end, awake
                     )  # fmt: skip
             total = int(size.sum())
+        # Waking a thread up takes as long as some hundred events; and what a neighborhood gave is in one strip.
+        shared = strips > 1 and everywhere and total >= SHARED_ACTIVE
         everywhere = defer > 0.0 or total * SEARCH_ALL > m
         visits += total
         _places(met, place)
         if place[strips] > coupling.size:
             neighbor = np.empty(place[strips] + place[strips] // np.uint64(8), np.uint32)
             coupling = np.empty(neighbor.size)
-        for parity in range(2):
-            for half in prange((strips + 1 - parity) // 2):
-                c = int(2 * np.int64(half) + parity)
-                stop = strip[c] + size[c]
-                evaluated[c] = _settle_strip(
-                    strip[c], stop, place[c], near, pair, V, span, member, load, guess, start, neighbor, coupling,
-                    end, awake, order[strip[c] : stop], woken[strip[c] : stop], again[strip[c] : stop], key,
-                    first_key[c],
-                )  # fmt: skip
+        if shared:
+            _settle_strips(
+                strip, size, place, near, pair, V, span, member, load, guess, start, neighbor, coupling, end, awake,
+                order, woken, again, key, first_key, evaluated,
+            )  # fmt: skip
+        else:
+            _settle_strips_alone(
+                strip, size, place, near, pair, V, span, member, load, guess, start, neighbor, coupling, end, awake,
+                order, woken, again, key, first_key, evaluated,
+            )  # fmt: skip
         evaluations, settled = _finish(
             strip, size, load, start, neighbor, coupling, end, awake, order, woken
         )  # fmt: skip
@@ -701,14 +760,11 @@ def _solve_spheres(
         for c in range(strips):
             if not _all_end(strip[c], strip[c] + size[c], end):
                 return impulse, iterations, visits, STALLED
-        for parity in range(2):
-            for half in prange((strips + 1 - parity) // 2):
-                c = int(2 * np.int64(half) + parity)
-                _apply(strip[c], strip[c] + size[c], found, near, end, pair, V, span, impulse)
+        if shared:
+            _apply_strips(strip, size, found, near, end, pair, V, span, impulse)
+        else:
+            _apply_strips_alone(strip, size, found, near, end, pair, V, span, impulse)
     return impulse, iterations, visits, 0
-
-
-_solve_spheres_alone = alone(_solve_spheres)
 
 
 @kernel

@@ -49,7 +49,7 @@ def in_strips(problem: ImpactProblem, strips: int, *, threshold: float, defer: f
     rows = sphere_rows(problem)
     assert rows is not None
     strip = (np.arange(strips + 1) * problem.m // strips).astype(np.int32)
-    return qce_stream._solve_spheres_alone(rows.normal, rows.body, rows.V, strip, threshold, defer, 10_000, 10**9)
+    return qce_stream._solve_spheres(rows.normal, rows.body, rows.V, strip, threshold, defer, 10_000, 10**9)
 
 
 def check_against_heap(problem: ImpactProblem, *, defer: float = 0.0, max_iterations: int = 10_000) -> None:
