@@ -326,8 +326,9 @@ def bench(
 )  # fmt: skip
 @click.option("--until-pattern", is_flag=True, help="Stop when the scene's measures show what it is for.")
 @click.option(
-    "--frames", "frame_every", type=click.IntRange(min=1), default=None, metavar="N", help="Steps between two frames."
-)
+    "--frames", "frame_every", type=click.IntRange(min=1), default=None, metavar="N",
+    help="Steps between two frames; the last step has one, too.",
+)  # fmt: skip
 @click.option(
     "--checkpoint", "checkpoint_every", type=click.IntRange(min=1), default=1000, show_default=True, metavar="N",
     help="Steps between two checkpoints; an interruption leaves one too.",

@@ -80,7 +80,7 @@ class Schedule:
     steps: int
     """Steps of the whole run, those of earlier calls included."""
     frame_every: int
-    """Steps between two frames."""
+    """Steps between two frames; the last step has one in any case."""
     checkpoint_every: int
     """Steps between two checkpoints."""
     duration: float = math.inf
@@ -155,6 +155,7 @@ def simulate(
         recorder = _Recorder(simulation, folder, schedule)
         try:
             why = _run(recorder, _Probes(simulation, store, run), schedule, until, on_step)
+            recorder.frame_at_the_end()
         finally:
             # Also of a run that cannot go on: its last steps tell why.
             recorder.checkpoint()
@@ -290,6 +291,11 @@ class _Recorder:
         if self._timed and math.isfinite(until):
             # A time that is a whole number of frames may miss the last one by rounding.
             self._watch_until(math.floor(until / self._scene.frame_time * (1.0 + TIME_ROUNDING)) + 1)
+
+    def frame_at_the_end(self) -> None:
+        """Take a frame of the last step, where none is due; a run that is given more steps drops it."""
+        if not self._timed and self.world.steps % self._schedule.frame_every != 0:
+            self._frame()
 
     def checkpoint(self) -> None:
         """Keep the state. Rows and frames first: a checkpoint never says more than there is."""

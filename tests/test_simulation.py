@@ -102,6 +102,14 @@ def test_a_run_killed_between_checkpoints_goes_on_bit_for_bit(whole: Path, tmp_p
     assert kept(tmp_path) == kept(whole)
 
 
+def test_a_run_ends_with_a_frame_that_a_longer_run_drops(whole: Path, tmp_path: Path) -> None:
+    for _ in range(2):
+        go(tmp_path, small(), steps=120)
+        assert [frame.step for frame in read_frames(tmp_path)] == [0, 50, 100, 120]
+    go(tmp_path, small())
+    assert kept(tmp_path) == kept(whole)
+
+
 def test_energy_is_accounted_for_in_every_step(whole: Path) -> None:
     rows = read_table(whole / STEPS)
     total = rows["kinetic"] + rows["potential"]
