@@ -68,6 +68,7 @@ def extended_pattern(
     steps_per_cycle: int | None = None,
     restitution: float | None = None,
     friction: float = 0.5,
+    tangential_restitution: float = 0.0,
 ) -> MovingScene:
     """Patterns of a vertically vibrated layer: 60,000 grains, 5.42 D deep, in a box of 100 D × 100 D.
 
@@ -77,9 +78,7 @@ def extended_pattern(
         steps_per_cycle: time steps in a period of the plate, ≥ 50; None: the fewest of at most `LONGEST_STEP`.
         restitution: of all contacts, in [0, 1]; None: e = max(1 - 0.3 v^(3/4), 0.7), v of each contact's blow.
         friction: coefficient of all contacts, ≥ 0.
-
-    Unlike in Bizon 1998, a contact that sticks keeps no tangential velocity: the tangential restitution β₀ = 0.35 is
-    not modeled, as the friction of Zhang 2015 has none.
+        tangential_restitution: β₀ of all contacts that stick, in [0, 1]; 0.35 in Bizon 1998, none in Zhang 2015.
 
     Source: Bizon 1998; Zhang 2015, Fig. 9.
 
@@ -94,18 +93,21 @@ def extended_pattern(
     if restitution is not None:
         check_number("restitution", restitution, low=0.0, high=1.0)
     check_number("friction", friction, low=0.0)
+    check_number("tangential_restitution", tangential_restitution, low=0.0, high=1.0)
     parameters = {
         "pattern": pattern,
         "side": side,
         "steps_per_cycle": steps_per_cycle,
         "restitution": restitution,
         "friction": friction,
+        "tangential_restitution": tangential_restitution,
     }
     settings = Settings(
         step=1.0 / (vibration(pattern).frequency * steps_per_cycle),
         gravity=1.0,
         restitution=SlowingRestitution() if restitution is None else Constant(restitution),
         friction=friction,
+        tangential_restitution=tangential_restitution,
     )
     return MovingScene(
         "extended-pattern",

@@ -1,7 +1,10 @@
 """The LCP with restitution and friction for spheres that spin, packed: `boxed_lcp` for the contacts of granular scenes.
 
     0 <= λ  complementary to  n · Δv - target >= 0              Δv = v_b - v_a
-    |λ_k| <= μ λ, opposing  t_k · (Δv - (s_a + s_b) × n)        k = 1, 2;  s = r ω, the spin as a surface speed
+    |λ_k| <= μ λ, opposing  w_k + β₀ w_k,pre                    w_k = t_k · (Δv - (s_a + s_b) × n),  k = 1, 2
+
+with s = r ω, the spin as a surface speed. A contact that sticks gives back the share β₀ of the velocity with which its
+surfaces slid, the other way around: the tangential restitution of Walton (1993), 0 in Zhang 2015.
 
 A contact's row is a normal and two bodies; t₁ = (-n_y, n_x, 0) / √(n_x² + n_y²) and t₂ = n × t₁ follow from the normal.
 An impulse Q = λ n + λ₁ t₁ + λ₂ t₂ changes v by ± Q / m and the spins of both bodies by -κ n × Q / m, κ = m r² / I, so
@@ -89,7 +92,7 @@ class SpinningResult:
 
 def sweep_spheres(
     rows: SpinningRows, target: Floats, start: Floats, *, friction: float, inertia: float, tolerance: float,
-    max_sweeps: int, overshoot: float = 1.0, buffers: Buffers | None = None,
+    max_sweeps: int, overshoot: float = 1.0, tangential_restitution: float = 0.0, buffers: Buffers | None = None,
 ) -> SpinningResult:  # fmt: skip
     """Solve the LCP with friction from given impulses; `rows.motion` is changed to the velocities after it.
 
@@ -102,26 +105,27 @@ def sweep_spheres(
         tolerance: natural-map residual at which to stop [m/s]; it is measured when a sweep changes less than that.
         max_sweeps: bound on sweeps, each over normals and tangents; two are made at a time.
         overshoot: factor ≥ 1 of the changes of every other sweep.
+        tangential_restitution: β₀ in [0, 1] of all contacts.
         buffers: memory for the rows.
     """
     m = len(rows.normal)
     buffers = buffers or Buffers()
     row, rub, before = buffers.array("row", (m, COLUMNS)), buffers.array("rub", (m, 2)), buffers.array("pre", (m, 3))
     report = np.zeros((rows.stripe.size - 1, REPORTS))
-    body, motion, stripe = rows.body, rows.motion, rows.stripe
+    body, motion, stripe, rebound = rows.body, rows.motion, rows.stripe, tangential_restitution
     _prepare(rows.normal, body, motion, stripe, target, start, inertia, row, rub, before)
     sweeps = 0
     while True:
-        _sweep(row, rub, body, motion, stripe, friction, inertia, overshoot, report)
+        _sweep(row, rub, before, body, motion, stripe, friction, inertia, rebound, overshoot, report)
         sweeps += SWEEPS_IN_A_ROW
         if sweeps >= max_sweeps or report[:, CHANGE].max() <= tolerance:
-            _measure(row, rub, before, body, motion, stripe, friction, inertia, report)
+            _measure(row, rub, before, body, motion, stripe, friction, inertia, rebound, report)
             if sweeps >= max_sweeps or report[:, RESIDUAL].max() <= tolerance:
                 break
     share = _share(report)
     if share < 1.0:
         _shorten(row, rub, body, motion, stripe, inertia, share)
-        _measure(row, rub, before, body, motion, stripe, friction, inertia, report)
+        _measure(row, rub, before, body, motion, stripe, friction, inertia, rebound, report)
     # One thread adds a fixed number of sums in order: the same bits on any number of threads.
     work = 0.5 * float(report[:, PUSH_BEFORE].sum() + report[:, PUSH_AFTER].sum())
     return SpinningResult(row[:, PUSH], rub, sweeps, float(report[:, RESIDUAL].max()), work, share)
@@ -253,8 +257,8 @@ def _prepare(
 
 @kernel
 def _sweep_stripe(
-    row: Floats, rub: Floats, body: Indices, motion: Floats, begin: int, end: int, friction: float, inertia: float,
-    factor: float,
+    row: Floats, rub: Floats, before: Floats, body: Indices, motion: Floats, begin: int, end: int, friction: float,
+    inertia: float, rebound: float, factor: float,
 ) -> float:  # fmt: skip
     """One sweep over one stripe; returns the largest change of a relative velocity that it made.
 
@@ -294,6 +298,10 @@ def _sweep_stripe(
         sz = sz_a + sz_b
         along = tx * dx + ty * dy - (sx * ox + sy * oy + sz * oz)
         across = ox * dx + oy * dy + oz * dz + (sx * tx + sy * ty)
+        # Otherwise `before` stays out of the cache.
+        if rebound > 0.0:
+            along += rebound * before[i, 1]
+            across += rebound * before[i, 2]
         bound = friction * new_push
         rub_1 = rub[i, 0]
         rub_2 = rub[i, 1]
@@ -327,21 +335,25 @@ def _sweep_stripe(
 
 @parallel_kernel
 def _sweep(
-    row: Floats, rub: Floats, body: Indices, motion: Floats, stripe: Ints, friction: float, inertia: float,
-    overshoot: float, report: Floats,
+    row: Floats, rub: Floats, before: Floats, body: Indices, motion: Floats, stripe: Ints, friction: float,
+    inertia: float, rebound: float, overshoot: float, report: Floats,
 ) -> None:  # fmt: skip
     """Two sweeps over all contacts, the even stripes first."""
     for half in range(2):
         for k in prange((stripe.size - half) // 2):
             s = 2 * k + half
-            _sweep_stripe(row, rub, body, motion, stripe[s], stripe[s + 1], friction, inertia, overshoot)
-            report[s, CHANGE] = _sweep_stripe(row, rub, body, motion, stripe[s], stripe[s + 1], friction, inertia, 1.0)
+            begin = stripe[s]
+            end = stripe[s + 1]
+            _sweep_stripe(row, rub, before, body, motion, begin, end, friction, inertia, rebound, overshoot)
+            report[s, CHANGE] = _sweep_stripe(
+                row, rub, before, body, motion, begin, end, friction, inertia, rebound, 1.0
+            )  # fmt: skip
 
 
 @kernel
 def _measure_stripe(
     row: Floats, rub: Floats, before: Floats, body: Indices, motion: Floats, begin: int, end: int, friction: float,
-    inertia: float, report: Floats,
+    inertia: float, rebound: float, report: Floats,
 ) -> None:  # fmt: skip
     """Fill the report of one stripe, shape (REPORTS,)."""
     slip = 1.0 / (1.0 + inertia)
@@ -356,8 +368,8 @@ def _measure_stripe(
         rub_1 = rub[i, 0]
         rub_2 = rub[i, 1]
         sliding = max(
-            abs(_clamped(rub_1 - along * freedom * slip, bound) - rub_1),
-            abs(_clamped(rub_2 - across * freedom * slip, bound) - rub_2),
+            abs(_clamped(rub_1 - (along + rebound * before[i, 1]) * freedom * slip, bound) - rub_1),
+            abs(_clamped(rub_2 - (across + rebound * before[i, 2]) * freedom * slip, bound) - rub_2),
         )
         residual = max(residual, sliding * (1.0 + inertia) / freedom)
         push_before += push * before[i, 0]
@@ -374,12 +386,12 @@ def _measure_stripe(
 @parallel_kernel
 def _measure(
     row: Floats, rub: Floats, before: Floats, body: Indices, motion: Floats, stripe: Ints, friction: float,
-    inertia: float, report: Floats,
+    inertia: float, rebound: float, report: Floats,
 ) -> None:  # fmt: skip
     """Natural map of normals and tangents, and what the work of the impulses is made of, per stripe."""
     for k in prange(stripe.size - 1):
         _measure_stripe(
-            row, rub, before, body, motion, stripe[k], stripe[k + 1], friction, inertia, report[k]
+            row, rub, before, body, motion, stripe[k], stripe[k + 1], friction, inertia, rebound, report[k]
         )  # fmt: skip
 
 

@@ -9,7 +9,7 @@ import numba
 import numpy as np
 import pytest
 
-from scenarios.granular import falling_gas
+from scenarios.granular import extended_pattern, falling_gas
 from scenarios.moving import MOVING
 from scenarios.world import grid, stepping
 from scenarios.world.checkpoint import FORMAT, CheckpointError, checkpoint, resume
@@ -283,6 +283,68 @@ def test_a_rolling_start_ends_without_slip_as_a_solid_sphere_does() -> None:
     assert world.spheres.velocity[0, 0] == pytest.approx(5.0 / 14.0, rel=1e-9)
     # ω points along +y for a ball that rolls along +x.
     assert world.spheres.spin[0, 1] == pytest.approx(5.0 / 14.0, rel=1e-9)
+
+
+BIZON = 0.35
+
+
+def bounced(slip: float, *, wall: bool, tangential_restitution: float = BIZON) -> tuple[World, float, StepReport]:
+    """A spinning sphere, or two, after an impact at speed 1 along x with e = 0.5 and μ = 0.5.
+
+    Args:
+        slip: velocity of the surfaces along one another before it.
+        wall: whether it is with the wall at x = 0, or of two spheres with one another.
+        tangential_restitution: β₀.
+
+    Returns:
+        The scene, the slip after the impact, and what the step came to.
+    """
+    if wall:
+        pair = spheres([[0.5, 2.0, 2.0]], 0.5, 1.0, [[-1.0, slip, 0.0]])
+    else:
+        pair = spheres([[1.0, 2.0, 2.0], [2.0, 2.0, 2.0]], 0.5, 1.0, [[0.5, 0.0, 0.0], [-0.5, 0.7 * slip, 0.0]])
+        # Spins move the surfaces by -(s_a + s_b) along y.
+        pair.motion[0, 6] = -0.3 * slip
+    settings = Settings(1e-12, 0.0, Constant(0.5), 0.5, tangential_restitution)
+    world = World("bounce", pair, box(9.0, 4.0, Still()), settings, Streamed(1_000, TIGHT))
+    report = world.step()
+    v, s = world.spheres.velocity, world.spheres.motion[:, 4:7]
+    after = v[0, 1] - s[0, 2] if wall else v[1, 1] - v[0, 1] - s[0, 2] - s[1, 2]
+    return world, float(after), report
+
+
+@pytest.mark.kernels
+@pytest.mark.parametrize("wall", [True, False])
+def test_a_contact_that_sticks_gives_back_a_share_of_its_slip(wall: bool) -> None:
+    # Walton 1993: w⁺ = max(-β₀ w, w - (1 + κ) μ (1 + e) v_n) with κ = m r² / I = 5/2.
+    sliding = 3.5 * 0.5 * 1.5
+    for slip in (0.2, 1.0, 0.99 * sliding / (1.0 + BIZON), 1.01 * sliding / (1.0 + BIZON), 4.0):
+        world, after, report = bounced(slip, wall=wall)
+        assert after == pytest.approx(max(-BIZON * slip, slip - sliding), abs=1e-9)
+        assert report.status is Status.CONVERGED
+        assert report.energy.friction < 0.0
+        if not wall:
+            # About the contact neither sphere gains angular momentum: I ω changes by r m v.
+            v, s = world.spheres.velocity, world.spheres.motion[:, 4:7]
+            assert v[:, 1].sum() == pytest.approx(0.7 * slip, abs=1e-12)
+            assert s[0, 2] - -0.3 * slip == pytest.approx(2.5 * v[0, 1], abs=1e-9)
+    assert bounced(1.0, wall=wall, tangential_restitution=0.0)[1] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_tangential_restitution_gives_a_layer_no_energy() -> None:
+    settings = Settings(0.02, 1.0, Constant(0.3), 0.5, 1.0)
+    world = World("shaken", gas(), box(5.0, 5.0, Vibration(0.5, 0.2)), settings, Streamed())
+    reports = run(world, 300)
+    assert max(report.contacts for report in reports) > 100
+    assert max(report.gain for report in reports) <= ROUNDING
+
+
+def test_an_impact_with_tangential_restitution_is_no_problem_for_other_solvers() -> None:
+    world = extended_pattern(side=4, tangential_restitution=BIZON).world(solver=SOLVERS["qce-lcp"]())
+    with pytest.raises(UnsupportedProblem, match="tangential_restitution must be 0"):
+        world.step()
+    with pytest.raises(ProblemError, match="tangential_restitution"):
+        extended_pattern(tangential_restitution=1.5)
 
 
 def test_a_slow_impact_keeps_more_than_a_fast_one() -> None:

@@ -35,7 +35,7 @@ from scenarios.contacts import tangents_of
 from scenarios.world.grid import Contacts, Indices
 from scenarios.world.spheres import INVERSE_INERTIA, PARTS, Ints
 from scenarios.world.warm_start import NO_IMPULSES, LastImpulses, labels_of
-from solvers import ImpactProblem, Solver, Status
+from solvers import ImpactProblem, Solver, Status, UnsupportedProblem
 from solvers._jit import kernel, parallel_kernel, prange
 from solvers.buffers import Buffers
 from solvers.qce_stream import solve_spheres
@@ -119,6 +119,8 @@ class Impact:
     """Coefficient of friction of all contacts."""
     label: Ints
     """As `Spheres.label`, shape (bodies,)."""
+    tangential_restitution: float = 0.0
+    """β₀ of all contacts that stick, in [0, 1] (see `solvers.spinning_spheres`)."""
     last: LastImpulses = NO_IMPULSES
     """Impulses of the step before."""
     buffers: Buffers = field(default_factory=Buffers)
@@ -185,7 +187,15 @@ class Impact:
         return {"start": guess[:, 0].copy(), "friction_start": guess[:, 1:].ravel()}
 
     def problem(self) -> ImpactProblem:
-        """The impact for any solver: blocks v of three a sphere, with friction blocks (v, s) of six."""
+        """The impact for any solver: blocks v of three a sphere, with friction blocks (v, s) of six.
+
+        Raises:
+            UnsupportedProblem: it has a tangential restitution, which an `ImpactProblem` cannot tell.
+        """
+        if self.tangential_restitution > 0.0:
+            raise UnsupportedProblem(
+                "tangential_restitution must be 0 here: only qce-lcp-fast and qce-lcp-accurate know of it"
+            )
         restitution = self.coefficient
         normal = self.contacts.normal
         if self.friction == 0.0:
@@ -307,7 +317,8 @@ class Streamed:
         result = sweep_spheres(
             SpinningRows(contacts.normal, contacts.body, impact.motion, contacts.stripe),
             target, start, friction=impact.friction, inertia=INVERSE_INERTIA,
-            tolerance=self.tolerance * speed, max_sweeps=max_sweeps, overshoot=overshoot, buffers=buffers,
+            tolerance=self.tolerance * speed, max_sweeps=max_sweeps, overshoot=overshoot,
+            tangential_restitution=impact.tangential_restitution, buffers=buffers,
         )  # fmt: skip
         residual = result.residual / (speed or 1.0)
         if status is Status.CONVERGED and residual > self.tolerance:

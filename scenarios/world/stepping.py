@@ -72,6 +72,9 @@ class Settings:
     friction: float = 0.0
     """Coefficient of friction of all contacts."""
 
+    tangential_restitution: float = 0.0
+    """β₀ of all contacts that stick, in [0, 1] (see `solvers.spinning_spheres`)."""
+
     largest_move: float = 1.0
     """Share of the smallest radius that no sphere may exceed in a step: faster ones could pass one another unseen."""
 
@@ -278,7 +281,10 @@ class World:
             self._list(ahead.copy(), height)
             strays = NO_STRAYS
         contacts = self._neighbors.touching(ahead, self.container, strays=strays, buffers=buffers)
-        return Impact(contacts, motion, settings.restitution, settings.friction, spheres.label, self._last, buffers)
+        return Impact(
+            contacts, motion, settings.restitution, settings.friction, spheres.label, settings.tangential_restitution,
+            self._last, buffers,
+        )  # fmt: skip
 
     def _fall(self, fall: float, height: float, motion: Floats, ahead: Floats) -> Indices | None:
         """Fill velocities after gravity and shaking, and the places ahead.
