@@ -67,6 +67,8 @@ EXIT_INTERRUPTED = 130
 # Columns of a table that goes to a file or a pipe.
 PLAIN_WIDTH = 120
 # Failures shown one by one at the end; the others are in the report.
+# Options of a first call: what it began goes on without them.
+ONCE = ("--fresh", "--retry")
 SHOWN_FAILURES = 10
 # Rows that stand behind a claim, as far as they are named.
 SHOWN_ROWS = 4
@@ -153,6 +155,7 @@ def _limit_options(command: Command) -> Command:
     """Options that bound a task, and start a run anew."""
     for option in (
         click.option("--fresh", is_flag=True, help="Set earlier results aside (renamed, not deleted) and start anew."),
+        click.option("--retry", is_flag=True, help="Measure again what crashed, failed or went over its limits."),
         click.option(
             "--memory", "memory_mb", type=click.FloatRange(min=1), default=4096, show_default=True, metavar="MIB",
             help="Memory that one task may allocate.",
@@ -270,7 +273,7 @@ def run(out: Path, **options: Any) -> None:
 )
 def bench(
     out: Path, tier: str, scenarios: tuple[str, ...], solvers: tuple[str, ...], sizes: str, repeats: int | None,
-    jobs: int, seed: int, timeout_s: float, memory_mb: float, fresh: bool,
+    jobs: int, seed: int, timeout_s: float, memory_mb: float, fresh: bool, retry: bool,
 ) -> None:  # fmt: skip
     """Measure speed against error, growth with size, and first solves; then write bench.md, CSV and figures.
 
@@ -301,10 +304,10 @@ def bench(
             with _terminated_as_interrupted(), progress_display() as display:
                 summary = run_bench(
                     out, plan, seed=seed, jobs=jobs, limits=Limits(timeout_s, memory_mb), command=_command_line(),
-                    on_progress=display,
+                    on_progress=display, retry=retry,
                 )  # fmt: skip
         except KeyboardInterrupt:
-            click.echo(f"\ninterrupted; the same command goes on:\n  {_command_line(without='--fresh')}", err=True)
+            click.echo(f"\ninterrupted; the same command goes on:\n  {_command_line(without=ONCE)}", err=True)
             sys.exit(EXIT_INTERRUPTED)
         _print_summary(out, summary)
         with _open(out) as store:
@@ -406,7 +409,7 @@ def _run_simulation(simulation: Simulation, out: Path, schedule: Schedule, until
                 until=simulation.scene.reached if until_pattern else lambda _: False, on_step=display,
             )  # fmt: skip
     except KeyboardInterrupt:
-        _say(f"\ninterrupted; the same command goes on:\n  {_command_line(without='--fresh')}")
+        _say(f"\ninterrupted; the same command goes on:\n  {_command_line(without=ONCE)}")
         sys.exit(EXIT_INTERRUPTED)
     _say(why)
 
@@ -786,12 +789,16 @@ def compare(earlier: Path, later: Path, report: Path | None) -> None:
     sys.exit(EXIT_FAILED_TASKS if comparison.failures else 0)
 
 
-def _measure_gate(out: Path, plan: list[PlannedTask], *, no_measure: bool, fresh: bool, **options: Any) -> None:
+def _measure_gate(
+    out: Path, plan: list[PlannedTask], *, no_measure: bool, fresh: bool, retry: bool, **options: Any
+) -> None:
     """Measure what the gate compares, as far as OUT lacks it; who lost a task is in the table."""
     if no_measure and fresh:
         raise BadInput("--fresh would leave nothing to compare with --no-measure")
+    if no_measure and retry:
+        raise BadInput("--retry measures, which --no-measure forbids")
     if not no_measure:
-        _measure_plan(out, plan, fresh=fresh, **options)
+        _measure_plan(out, plan, fresh=fresh, retry=retry, **options)
 
 
 def _time_against(revision: str, plan: list[PlannedTask], timeout_s: float) -> TimeComparison:
@@ -823,6 +830,7 @@ def _measure_plan(
     timeout_s: float,
     memory_mb: float,
     fresh: bool,
+    retry: bool,
 ) -> int:
     """Measure what is not done yet of a plan; returns the number of tasks without an answer."""
     from harness.environment import available_cores
@@ -843,12 +851,12 @@ def _measure_plan(
         with _terminated_as_interrupted(), progress_display() as display:
             summary = measure(
                 out, plan, seed=seed, jobs=workers, limits=Limits(timeout_s, memory_mb), command=_command_line(),
-                tier=tier, on_progress=display,
+                tier=tier, on_progress=display, retry=retry,
             )  # fmt: skip
     except KeyboardInterrupt:
         click.echo(
             f"\ninterrupted; what was measured is in {out}. The same command goes on where it stopped:\n"
-            f"  {_command_line(without='--fresh')}",
+            f"  {_command_line(without=ONCE)}",
             err=True,
         )
         sys.exit(EXIT_INTERRUPTED)
@@ -896,6 +904,8 @@ def _print_summary(out: Path, summary: Summary) -> None:
     if len(summary.lost) > SHOWN_FAILURES:
         more = len(summary.lost) - SHOWN_FAILURES
         click.echo(f"  and {more} more: impactbench export --table tasks --out {out}", err=True)
+    if summary.lost:
+        click.echo("the same command with --retry measures them again", err=True)
 
 
 @contextmanager
@@ -1073,9 +1083,9 @@ def _explained_errors() -> Iterator[None]:
         sys.exit(EXIT_INTERRUPTED)
 
 
-def _command_line(*, without: str = "") -> str:
+def _command_line(*, without: Collection[str] = ()) -> str:
     """The command as it was given, for the record; the user's home folder is not part of it."""
-    words = [word for word in sys.argv[1:] if word != without]
+    words = [word for word in sys.argv[1:] if word not in without]
     home = os.path.expanduser("~")
     return shlex.join(["impactbench", *(word.replace(home, "~") if len(home) > 1 else word for word in words)])
 

@@ -113,6 +113,7 @@ def measure(
     command: str,
     tier: str,
     on_progress: Callable[[Progress], None],
+    retry: bool = False,
 ) -> Summary:
     """Store a plan and measure all that is not done yet, in child processes.
 
@@ -125,6 +126,7 @@ def measure(
         command: as it was called, for the record.
         tier: name of the tier that the plan comes from, for the record.
         on_progress: called at the start, whenever a task ended, and a few times a second between.
+        retry: measure those again that an earlier run lost (`FAILURES`).
 
     Returns:
         What the tasks of the plan came to, now or by an earlier run.
@@ -149,6 +151,8 @@ def measure(
             command=command,
         )
         rows = store.plan(plan, run=run)
+        if retry:
+            store.plan_again(rows, FAILURES)
         _run_pending(store, rows, run, jobs=jobs, limits=limits, on_progress=on_progress)
         store.finish_run(run)
         return _summary(store, rows)

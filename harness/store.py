@@ -243,6 +243,22 @@ class Store:
             for number, kind, solver, settings, scenario, parameters, label, tags, seed in rows
         ]  # fmt: skip
 
+    def plan_again(self, numbers: Iterable[int], outcomes: Iterable[Outcome]) -> None:
+        """Make tasks planned that ended so, without an answer; what others measured stays as it is.
+
+        Args:
+            numbers: rows of tasks.
+            outcomes: those of tasks that measured nothing.
+        """
+        ended = [outcome.value for outcome in outcomes if outcome is not Outcome.MEASURED]
+        places = ", ".join("?" * len(ended))
+        with self._transaction() as connection:
+            connection.executemany(
+                "UPDATE tasks SET state = 'planned', outcome = NULL, reason = NULL, wall_s = NULL,"
+                f" peak_memory_mb = NULL WHERE task = ? AND outcome IN ({places})",
+                [(number, *ended) for number in numbers],
+            )
+
     def record(self, number: int, ending: Ending, *, run: int) -> None:
         """Store how a task ended and all that it measured, in one transaction.
 

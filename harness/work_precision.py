@@ -244,6 +244,7 @@ def run_bench(
     limits: Limits,
     command: str,
     on_progress: Callable[[Progress], None],
+    retry: bool = False,
 ) -> Summary:
     """Store a plan and measure all that is not done yet: errors first, then the rounds of times.
 
@@ -255,6 +256,7 @@ def run_bench(
         limits: of each task.
         command: as it was called, for the record.
         on_progress: called at the start, whenever a task ended, and a few times a second between.
+        retry: measure those again that an earlier run lost (`FAILURES`).
 
     Returns:
         What the tasks of the plan came to, now or by an earlier run.
@@ -274,6 +276,8 @@ def run_bench(
             command=command,
         )
         rows = set(store.plan(plan, run=run))
+        if retry:
+            store.plan_again(rows, FAILURES)
         # Rows that another plan left open stay so: this command did not ask for them.
         pending = [planned for planned in store.pending() if planned.number in rows]
         runner = _Runner(store, run, limits, on_progress, total=len(rows), done=len(rows) - len(pending))

@@ -354,6 +354,45 @@ def test_a_crash_is_reported_and_exits_with_1_each_time(tmp_path: Path, user_fil
         assert "crashed: the process was killed by SIGABRT" in done.output
 
 
+# Mends itself from outside: a solver's file must not change between two calls.
+FLAKY = """
+    from solvers import SOLVERS
+
+    @dataclass(frozen=True)
+    class Flaky:
+        def solve(self, problem):
+            if not os.path.exists(os.path.join(os.path.dirname(__file__), "mended")):
+                os.abort()
+            return SOLVERS["qce"]().solve(problem)
+"""
+
+
+def test_retry_measures_what_was_lost_again_and_nothing_else(tmp_path: Path, user_file: Callable[[str], Path]) -> None:
+    path, out = user_file(FLAKY), tmp_path / "out"
+    plan = (
+        "run", "--solver", f"{path}:Flaky", "--solver", "gauss-seidel", "--scenario", "bernoulli", "--tier", "smoke",
+        "--out", str(out),
+    )  # fmt: skip
+    lost = call(*plan)
+    assert lost.exit_code == 1
+    assert {"1 measured", "1 crashed"} <= set(re.findall(r"\d \w+", lost.output))
+    assert "--retry measures them again" in lost.output
+    path.with_name("mended").touch()
+    assert call(*plan).exit_code == 1
+    assert call("check", "--no-measure", "--retry", "--out", str(out)).exit_code == 2
+    with Store.open(out) as store:
+        before = store.frame("tasks").set_index("solver")
+    mended = call(*plan, "--retry")
+    assert mended.exit_code == 0, mended.output
+    assert "2 measured" in mended.output
+    with Store.open(out) as store:
+        after = store.frame("tasks").set_index("solver")
+    assert after["outcome"].tolist() == ["measured", "measured"]
+    # The run that measured a task is stored with it.
+    assert (after["run"] > before["run"]).sum() == 1
+    assert after.loc["gauss-seidel", "wall_s"] == before.loc["gauss-seidel", "wall_s"]
+
+
 def test_fresh_sets_earlier_results_aside(tmp_path: Path, user_file: Callable[[str], Path]) -> None:
     arguments = (
         "run", "--solver", f"{user_file(REFUSING)}:Refuses", "--scenario", "bernoulli", "--tier", "smoke",
