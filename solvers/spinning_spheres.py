@@ -91,15 +91,17 @@ class SpinningResult:
 
 
 def sweep_spheres(
-    rows: SpinningRows, target: Floats, start: Floats, *, friction: float, inertia: float, tolerance: float,
-    max_sweeps: int, overshoot: float = 1.0, tangential_restitution: float = 0.0, buffers: Buffers | None = None,
+    rows: SpinningRows, target: Floats, start: Floats, rub_start: Floats | None = None, *, friction: float,
+    inertia: float, tolerance: float, max_sweeps: int, overshoot: float = 1.0, tangential_restitution: float = 0.0,
+    buffers: Buffers | None = None,
 ) -> SpinningResult:  # fmt: skip
     """Solve the LCP with friction from given impulses; `rows.motion` is changed to the velocities after it.
 
     Args:
         rows: contacts and the velocities before them.
         target: normal relative velocity to reach at least [m/s], shape (m,).
-        start: first guess of λ ≥ 0, λ₁ and λ₂ [N s], shape (m, 3).
+        start: first guess of λ ≥ 0 [N s], shape (m,).
+        rub_start: first guess of λ₁ and λ₂ [N s], shape (m, 2); None: 0.
         friction: coefficient of friction μ ≥ 0 of all contacts.
         inertia: κ = m r² / I, 2.5 for solid spheres.
         tolerance: natural-map residual at which to stop [m/s]; it is measured when a sweep changes less than that.
@@ -111,9 +113,10 @@ def sweep_spheres(
     m = len(rows.normal)
     buffers = buffers or Buffers()
     row, rub, before = buffers.array("row", (m, COLUMNS)), buffers.array("rub", (m, 2)), buffers.array("pre", (m, 3))
+    guess = np.empty((0, 2)) if rub_start is None else rub_start
     report = np.zeros((rows.stripe.size - 1, REPORTS))
     body, motion, stripe, rebound = rows.body, rows.motion, rows.stripe, tangential_restitution
-    _prepare(rows.normal, body, motion, stripe, target, start, inertia, row, rub, before)
+    _prepare(rows.normal, body, motion, stripe, target, start, guess, inertia, row, rub, before)
     sweeps = 0
     while True:
         _sweep(row, rub, before, body, motion, stripe, friction, inertia, rebound, overshoot, report)
@@ -210,9 +213,10 @@ def _clamped(value: float, bound: float) -> float:
 @kernel
 def _pack(
     normal: Floats, body: Indices, motion: Floats, begin: int, end: int, target: Floats, start: Floats,
-    row: Floats, rub: Floats, before: Floats,
+    guess: Floats, row: Floats, rub: Floats, before: Floats,
 ) -> None:  # fmt: skip
     """Pack some contacts, and the first guess of their impulses."""
+    guessed = guess.shape[0] > 0
     for i in range(np.uint64(begin), np.uint64(end)):
         nx = normal[i, 0]
         ny = normal[i, 1]
@@ -227,9 +231,9 @@ def _pack(
         b = body[i, 1]
         row[i, FREEDOM] = 1.0 / (motion[a, 3] + motion[b, 3])
         row[i, TARGET] = target[i]
-        row[i, PUSH] = start[i, 0]
-        rub[i, 0] = start[i, 1]
-        rub[i, 1] = start[i, 2]
+        row[i, PUSH] = start[i]
+        rub[i, 0] = guess[i, 0] if guessed else 0.0
+        rub[i, 1] = guess[i, 1] if guessed else 0.0
         before[i, 0], before[i, 1], before[i, 2] = _approach(row, i, motion, a, b)
 
 
@@ -243,12 +247,12 @@ def _push(row: Floats, rub: Floats, body: Indices, motion: Floats, begin: int, e
 
 @parallel_kernel
 def _prepare(
-    normal: Floats, body: Indices, motion: Floats, stripe: Ints, target: Floats, start: Floats, inertia: float,
-    row: Floats, rub: Floats, before: Floats,
+    normal: Floats, body: Indices, motion: Floats, stripe: Ints, target: Floats, start: Floats, guess: Floats,
+    inertia: float, row: Floats, rub: Floats, before: Floats,
 ) -> None:  # fmt: skip
     """Pack the contacts, and apply the first guess of their impulses."""
     for k in prange(stripe.size - 1):
-        _pack(normal, body, motion, stripe[k], stripe[k + 1], target, start, row, rub, before)
+        _pack(normal, body, motion, stripe[k], stripe[k + 1], target, start, guess, row, rub, before)
     for half in range(2):
         for k in prange((stripe.size - half) // 2):
             s = 2 * k + half

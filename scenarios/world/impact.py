@@ -75,6 +75,8 @@ class Constant:
 
     def of(self, speed: Floats) -> Floats:
         """c_r for speeds ≥ 0 [m/s], shape (m,)."""
+        if self.resting == 0.0:
+            return np.full(speed.shape, self.value)
         return np.where(speed < self.resting, 0.0, self.value)
 
 
@@ -173,18 +175,19 @@ class Impact:
         lies = not self.restitution.by_blow and (self.coefficient == 0.0).any()
         return labels_of(self.contacts, self.label) if lies else None
 
-    def guess(self) -> Floats:
-        """First guess of λ, λ₁ and λ₂ [N s], shape (m, 3): what lies has the last step's impulses, the rest none."""
-        guess: Floats = self.buffers.array("guess", (self.contacts.m, 3))
-        guess[:] = 0.0
-        if self.pair is not None:
-            np.copyto(guess, self.last.at(self.pair), where=self.coefficient[:, None] == 0.0)
-        return guess
+    def guess(self) -> Floats | None:
+        """First guess of λ, λ₁ and λ₂ [N s], shape (m, 3): what lies has the last step's impulses, the rest none.
+
+        None where nothing lies.
+        """
+        if self.pair is None:
+            return None
+        return np.where(self.coefficient[:, None] == 0.0, self.last.at(self.pair), 0.0)
 
     def starts(self) -> dict[str, Floats]:
         """The guess by the names under which solvers take it: with it, a saved problem gives the step's bits again."""
         guess = self.guess()
-        return {"start": guess[:, 0].copy(), "friction_start": guess[:, 1:].ravel()}
+        return {} if guess is None else {"start": guess[:, 0].copy(), "friction_start": guess[:, 1:].ravel()}
 
     def problem(self) -> ImpactProblem:
         """The impact for any solver: blocks v of three a sphere, with friction blocks (v, s) of six.
@@ -271,8 +274,7 @@ class ByProblem:
         problem = impact.problem()
         solve: Callable[..., ImpactSolution] = self.solver.solve
         takes = inspect.signature(solve).parameters
-        starts = {} if impact.pair is None else impact.starts()
-        solution = solve(problem, **{name: guess for name, guess in starts.items() if name in takes})
+        solution = solve(problem, **{name: guess for name, guess in impact.starts().items() if name in takes})
         motion = impact.motion
         if impact.friction == 0.0:
             motion[:-1, :3] = solution.v_post.reshape(-1, 3)
@@ -308,15 +310,20 @@ class Streamed:
         speed, restitution, pair = impact.speed, impact.coefficient, impact.pair
         overshoot, max_sweeps = (OVERSHOOT, self.max_sweeps) if pair is None else (1.0, 2 * self.max_sweeps)
         max_sweeps = max(max_sweeps, self.least_visits // max(contacts.m, 1))
-        start, target = impact.guess(), buffers.array("target", (contacts.m,))
-        target[:] = 0.0
-        iterations, status = 0, Status.CONVERGED
-        # QCE has no part in an inelastic impact.
+        start, target = buffers.array("start", (contacts.m,)), buffers.array("target", (contacts.m,))
         if restitution.any():
             iterations, status = _predict(impact, start, target)
+        else:
+            # QCE has no part in an inelastic impact.
+            iterations, status = 0, Status.CONVERGED
+            start[:], target[:] = 0.0, 0.0
+        rub_start, guess = None, impact.guess()
+        if guess is not None:
+            start += guess[:, 0]
+            rub_start = guess[:, 1:].copy()
         result = sweep_spheres(
             SpinningRows(contacts.normal, contacts.body, impact.motion, contacts.stripe),
-            target, start, friction=impact.friction, inertia=INVERSE_INERTIA,
+            target, start, rub_start, friction=impact.friction, inertia=INVERSE_INERTIA,
             tolerance=self.tolerance * speed, max_sweeps=max_sweeps, overshoot=overshoot,
             tangential_restitution=impact.tangential_restitution, buffers=buffers,
         )  # fmt: skip
@@ -328,7 +335,7 @@ class Streamed:
 
 
 def _predict(impact: Impact, start: Floats, target: Floats) -> tuple[int, Status]:
-    """Form of QCE's answer the first guess of λ and the velocity to reach; returns its iterations."""
+    """Fill a first guess of λ and the velocity to reach with what QCE's answer says; returns its iterations."""
     elastic = impact.elastic
     _aim(impact.contacts.stripe, impact.coefficient, elastic.impulse, elastic.parting, start, target)
     if elastic.stalled:
@@ -397,10 +404,10 @@ def _repeat(stripe: Ints, blow: Floats, parting: Floats, coefficient: Floats) ->
 
 @parallel_kernel
 def _aim(stripe: Ints, coefficient: Floats, impulse: Floats, parting: Floats, start: Floats, target: Floats) -> None:
-    """Fill the velocity to reach after QCE's answer, and add to the guess of λ."""
+    """Fill the velocity to reach after QCE's answer, and a guess of λ."""
     for k in prange(stripe.size - 1):
         for i in range(stripe[k], stripe[k + 1]):
             e = coefficient[i]
             target[i] = e * parting[i]
             # (1 + e) / 2 is exact for one contact without friction; what lies has a guess of its own.
-            start[i, 0] += 0.5 * (1.0 + e) * impulse[i] if e > 0.0 else 0.0
+            start[i] = 0.5 * (1.0 + e) * impulse[i] if e > 0.0 else 0.0
