@@ -23,7 +23,7 @@ from reports.figures import BLACK, BLUE, GREEN, STYLE, TWO_COLUMNS, VERMILLION, 
 from reports.files import prepare, write_whole
 from reports.markdown import markdown_table
 from reports.scorecard import ReportError
-from scenarios.granular import DRIVING, PUBLISHED, THRESHOLDS, named_measures, shows
+from scenarios.granular import DIRECTIONS, DRIVING, PUBLISHED, THRESHOLDS, faultless_measures, named_measures, shows
 from scenarios.patterns import Pattern
 
 COLORS = {"squares": VERMILLION, "stripes": BLUE, "hexagons": GREEN, "flat": BLACK}
@@ -102,6 +102,7 @@ def patterns_markdown(records: Sequence[PatternRecord]) -> str:
         "",
         f"A pattern stands from the cycle on from which all later maps pass its thresholds: {_thresholds()}.",
         "",
+        *_faultless_lines(records),
         "## Beside Table 2 of Zhang 2015",
         "",
         TABLE_2_NOTE,
@@ -143,6 +144,31 @@ def _comparison_rows(record: PatternRecord) -> Iterator[tuple[str, ...]]:
     yield "", "Bizon 1998", str(panel.cycles or "–"), f"{panel.wavelength or '–'}", *published, "–", "–", "–", "–", ""
 
 
+def _faultless_lines(records: Sequence[PatternRecord]) -> Iterator[str]:
+    """What the measures of the recipe can be at best, beside their thresholds."""
+    shown = [record for record in records if record.pattern in DIRECTIONS]
+    if not shown:
+        return
+    rows = []
+    for record in shown:
+        ranges, limits = faultless_measures(record.pattern, record.side), THRESHOLDS[record.pattern]
+        cells = (
+            f"{ranges[name][0]:.2f} - {ranges[name][1]:.2f}" + (f" ({_limit(*limits[name])})" if name in limits else "")
+            for name in ("Q2", "Q4", "Q6")
+        )
+        rows.append((record.pattern, f"{record.side / (PUBLISHED[record.pattern].wavelength or np.nan):.1f}", *cells))
+    yield from (
+        "## Patterns without a fault",
+        "",
+        "The recipe's measures of standing waves of the published wavelength in this box, least and largest over all "
+        "ways in which they may be turned and displaced, and in brackets what counts as the pattern. So few waves do "
+        "not come to 1, and squares that stand along the walls pass hardly or not at all, however well ordered.",
+        "",
+        *markdown_table(("pattern", "waves across", "Q2", "Q4", "Q6"), rows),
+        "",
+    )
+
+
 def _numbers(found: Pattern) -> Iterator[str]:
     """All measures of a map."""
     for name in MEASURES:
@@ -154,11 +180,14 @@ def _numbers(found: Pattern) -> Iterator[str]:
 def _thresholds() -> str:
     """What a map must show of each pattern, in words."""
     return ", ".join(
-        f"{pattern} " + " and ".join(
-            f"{name} > {low:g}" if np.isfinite(low) else f"{name} < {high:g}" for name, (low, high) in bounds.items()
-        )
+        f"{pattern} " + " and ".join(f"{name} {_limit(*between)}" for name, between in bounds.items())
         for pattern, bounds in THRESHOLDS.items() if bounds
     )  # fmt: skip
+
+
+def _limit(low: float, high: float) -> str:
+    """One of two bounds, the other of which is infinite."""
+    return f"> {low:g}" if np.isfinite(low) else f"< {high:g}"
 
 
 def _table_2_rows(record: PatternRecord) -> Iterator[tuple[str, ...]]:

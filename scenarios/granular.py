@@ -7,13 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 import numpy.typing as npt
 
 from scenarios.parameters import check_choice, check_count, check_number, check_positive
-from scenarios.patterns import Pattern, height_map, measure_pattern
+from scenarios.patterns import Pattern, faultless_map, height_map, measure_pattern
 from scenarios.world.container import Motion, Shake, Vibration, box
 from scenarios.world.impact import Constant, Resolver, SlowingRestitution
 from scenarios.world.moving_scene import MovingScene, MovingWorld, Units
@@ -169,6 +169,30 @@ THRESHOLDS: dict[str, Mapping[str, tuple[float, float]]] = {
     "flat": {},
 }
 """Pattern → measure → between which it lies, as it does on the published panels (see `scenarios.patterns`)."""
+
+
+DIRECTIONS = {"squares": 2, "stripes": 1, "hexagons": 3}
+"""Pattern → directions of the standing waves that it is made of."""
+# A faultless pattern is turned and displaced in so many steps, as far as it repeats itself.
+TURNS, SHIFTS = 19, 4
+
+
+@cache
+def faultless_measures(pattern: str, side: float) -> dict[str, tuple[float, float]]:
+    """Least and largest Q2, Q4, Q6 of a pattern without a fault, however it lies in the box.
+
+    Its waves are those of the panel, in a box of `side` [D]: few of them, seen through a window, are less than 1.
+    """
+    wavelength, directions = PUBLISHED[pattern].wavelength, DIRECTIONS[pattern]
+    assert wavelength is not None
+    maps = (
+        faultless_map(directions, side / wavelength, turn, shift)
+        for turn in np.linspace(0.0, np.pi / directions, TURNS)
+        for shift in np.arange(SHIFTS) / SHIFTS
+    )
+    found = [measure_pattern(heights, side) for heights in maps]
+    values = {"Q2": [f.q2 for f in found], "Q4": [f.q4 for f in found], "Q6": [f.q6 for f in found]}
+    return {name: (min(of_all), max(of_all)) for name, of_all in values.items()}
 
 
 def shows(pattern: str, found: Mapping[str, float]) -> bool:

@@ -81,6 +81,20 @@ def height_map(place: Floats, side: float) -> Floats:
     return np.where(np.isfinite(highest), highest, np.nan)
 
 
+def faultless_map(directions: int, waves: float, turn: float = 0.0, shift: float = 0.0) -> Floats:
+    """Height map of standing waves without a fault, shape (CELLS, CELLS): what the measures can reach at most.
+
+    Args:
+        directions: 1 for stripes, 2 for squares, 3 for hexagons.
+        waves: wavelengths across the floor.
+        turn: of the first wave against the walls [rad].
+        shift: of the pattern along the first axis [wavelengths].
+    """
+    x, y = np.meshgrid(*2 * [waves * (np.arange(CELLS) + 0.5) / CELLS], indexing="ij")
+    angles = turn + np.pi * np.arange(directions) / directions
+    return np.asarray(sum(np.cos(2.0 * np.pi * (np.cos(a) * (x + shift) + np.sin(a) * y)) for a in angles))
+
+
 def measure_pattern(heights: Floats, side: float) -> Pattern:
     """Measure the pattern of a height map, shape (CELLS, CELLS), NaN where there is no grain.
 

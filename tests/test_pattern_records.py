@@ -17,7 +17,7 @@ from harness.simulation import simulate as run_simulation
 from harness.store import StoreError
 from harness.trajectory import read_frames
 from reports.patterns import patterns_markdown, standing_since
-from scenarios.patterns import CELLS, height_map
+from scenarios.patterns import CELLS, faultless_map, height_map
 from solvers.solution import Floats
 
 # Deflated heights of a hundredth of a grain that are all noise take up to 20 kB a map; 100 of them must stay small.
@@ -32,10 +32,7 @@ FACTS = {
 
 def waves(directions: int) -> Floats:
     """A pattern of four waves across, ten grains high."""
-    x, y = np.meshgrid(np.arange(CELLS) + 0.5, np.arange(CELLS) + 0.5, indexing="ij")
-    turns = 2.0 * np.pi * 4.0 / CELLS
-    angles = np.pi * np.arange(directions) / directions
-    return np.asarray(10.0 + sum(np.cos(turns * (np.cos(a) * x + np.sin(a) * y)) for a in angles))
+    return 10.0 + faultless_map(directions, 4.0)
 
 
 def record(pattern: str, *maps: Floats) -> PatternRecord:
@@ -87,6 +84,8 @@ def test_the_page_sets_each_run_beside_the_published_panel() -> None:
     assert "| flat | here | 10 | 25.0 |" in page
     assert "none is expected" in page
     assert "| Zhang 2015 | 13 / 46 / 1 | 0.28 / 2.74 |" in page
+    assert "| squares | 3.0 | 0.00 - 0.01 (< 0.1) | 0.58 - 0.85 (> 0.75) |" in page
+    assert "## Patterns without a fault" not in patterns_markdown([record("flat", waves(1))])
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from scenarios.patterns import CELLS, height_map, measure_pattern
+from scenarios.granular import PUBLISHED, THRESHOLDS, faultless_measures
+from scenarios.patterns import CELLS, faultless_map, height_map, measure_pattern
 from solvers.solution import Floats
 
 SIDE = 100.0
@@ -13,27 +14,16 @@ SIDE = 100.0
 WINDOW = 0.1
 
 
-def waves(count: int, waves_across: float, phase: float = 0.0) -> Floats:
-    """Sum of plane waves whose directions divide the half circle evenly."""
-    x, y = np.meshgrid(np.arange(CELLS) + 0.5, np.arange(CELLS) + 0.5, indexing="ij")
-    angles = phase + np.pi * np.arange(count) / count
-    turns = 2.0 * np.pi * waves_across / CELLS
-    total = np.zeros((CELLS, CELLS))
-    for angle in angles:
-        total += np.cos(turns * (np.cos(angle) * x + np.sin(angle) * y))
-    return total
-
-
 @pytest.mark.parametrize("phase", [0.0, 0.3, 1.0])
 def test_stripes_have_q2_near_one(phase: float) -> None:
-    found = measure_pattern(waves(1, 5.0, phase), SIDE)
+    found = measure_pattern(faultless_map(1, 5.0, phase), SIDE)
     assert found.wavelength == pytest.approx(SIDE / 5)
     assert found.q2 > 1.0 - WINDOW
 
 
 @pytest.mark.parametrize("phase", [0.0, 0.3])
 def test_squares_have_q4_near_one_and_no_q2(phase: float) -> None:
-    found = measure_pattern(waves(2, 4.0, phase), SIDE)
+    found = measure_pattern(faultless_map(2, 4.0, phase), SIDE)
     assert found.wavelength == pytest.approx(SIDE / 4)
     assert found.q4 > 0.8
     assert found.q2 < 0.1
@@ -41,12 +31,34 @@ def test_squares_have_q4_near_one_and_no_q2(phase: float) -> None:
 
 @pytest.mark.parametrize("phase", [0.0, 0.3])
 def test_hexagons_have_q6_and_neither_q2_nor_q4(phase: float) -> None:
-    found = measure_pattern(waves(3, 6.0, phase), SIDE)
+    found = measure_pattern(faultless_map(3, 6.0, phase), SIDE)
     assert found.wavelength == pytest.approx(SIDE / 6)
     assert found.q6 > 0.7
     # A shell of six waves holds few directions: turned out of the grid, the three waves do not weigh the same.
     assert found.q2 < 0.15
     assert found.q4 < 0.15
+
+
+@pytest.mark.parametrize(("pattern", "named"), [("stripes", "Q2"), ("hexagons", "Q6")])
+def test_a_faultless_pattern_passes_however_it_lies(pattern: str, named: str) -> None:
+    least, most = faultless_measures(pattern, SIDE)[named]
+    assert THRESHOLDS[pattern][named][0] < least < most <= 1.0
+
+
+def test_three_waves_of_squares_pass_only_where_they_lie_well() -> None:
+    least, most = faultless_measures("squares", SIDE)["Q4"]
+    assert least < THRESHOLDS["squares"]["Q4"][0] < most
+    # The panel of Bizon 1998 is one of those that do.
+    assert least < PUBLISHED["squares"].q4 < most
+    # Along the walls, where cos has its nodes or its peaks, and in larger boxes.
+    along = measure_pattern(faultless_map(2, 3.0, 0.0), SIDE)
+    assert along.q4 == pytest.approx(THRESHOLDS["squares"]["Q4"][0], abs=0.01)
+    assert measure_pattern(faultless_map(2, 10.0, 0.0), SIDE).q4 > 0.95
+
+
+def test_a_shift_of_a_wavelength_changes_nothing() -> None:
+    here, there = (faultless_map(1, 4.0, 0.0, shift) for shift in (0.0, 1.0))
+    assert there == pytest.approx(here, abs=1e-12)
 
 
 def test_noise_has_no_pattern() -> None:
@@ -116,8 +128,8 @@ def test_defects_take_the_order_of_the_whole_and_leave_that_of_the_neighbors() -
 
 
 def test_waves_are_as_high_as_they_are_deep() -> None:
-    assert measure_pattern(waves(1, 5.0), SIDE).skewness == pytest.approx(0.0, abs=0.05)
-    assert measure_pattern(waves(2, 4.0), SIDE).skewness == pytest.approx(0.0, abs=0.05)
+    assert measure_pattern(faultless_map(1, 5.0), SIDE).skewness == pytest.approx(0.0, abs=0.05)
+    assert measure_pattern(faultless_map(2, 4.0), SIDE).skewness == pytest.approx(0.0, abs=0.05)
 
 
 def test_peaks_on_a_line_have_no_triangles() -> None:
@@ -126,7 +138,7 @@ def test_peaks_on_a_line_have_no_triangles() -> None:
 
 
 def test_empty_cells_take_the_median() -> None:
-    heights = waves(1, 5.0)
+    heights = faultless_map(1, 5.0)
     heights[::7, ::11] = np.nan
     assert measure_pattern(heights, SIDE).q2 > 1.0 - WINDOW
 
