@@ -67,9 +67,9 @@ EXIT_INTERRUPTED = 130
 # Columns of a table that goes to a file or a pipe.
 PLAIN_WIDTH = 120
 # Failures shown one by one at the end; the others are in the report.
+SHOWN_FAILURES = 10
 # Options of a first call: what it began goes on without them.
 ONCE = ("--fresh", "--retry")
-SHOWN_FAILURES = 10
 # Rows that stand behind a claim, as far as they are named.
 SHOWN_ROWS = 4
 

@@ -181,7 +181,11 @@ TURNS, SHIFTS = 19, 4
 def faultless_measures(pattern: str, side: float) -> dict[str, tuple[float, float]]:
     """Least and largest Q2, Q4, Q6 of a pattern without a fault, however it lies in the box.
 
-    Its waves are those of the panel, in a box of `side` [D]: few of them, seen through a window, are less than 1.
+    Few waves, seen through the window of the recipe, do not come to 1.
+
+    Args:
+        pattern: of `DIRECTIONS`; its waves are as long as on the published panel.
+        side: of the box [D].
     """
     wavelength, directions = PUBLISHED[pattern].wavelength, DIRECTIONS[pattern]
     assert wavelength is not None
