@@ -149,24 +149,39 @@ def _faultless_lines(records: Sequence[PatternRecord]) -> Iterator[str]:
     shown = [record for record in records if record.pattern in DIRECTIONS]
     if not shown:
         return
-    rows = []
-    for record in shown:
-        ranges, limits = faultless_measures(record.pattern, record.side), THRESHOLDS[record.pattern]
-        cells = (
-            f"{ranges[name][0]:.2f} - {ranges[name][1]:.2f}" + (f" ({_limit(*limits[name])})" if name in limits else "")
-            for name in ("Q2", "Q4", "Q6")
-        )
-        rows.append((record.pattern, f"{record.side / (PUBLISHED[record.pattern].wavelength or np.nan):.1f}", *cells))
     yield from (
         "## Patterns without a fault",
         "",
         "The recipe's measures of standing waves of the published wavelength in this box, least and largest over all "
-        "ways in which they may be turned and displaced, and in brackets what counts as the pattern. So few waves do "
-        "not come to 1, and squares that stand along the walls pass hardly or not at all, however well ordered.",
+        "ways in which they may be turned and displaced, and where they are turned against the walls as the waves of "
+        "the last map are; in brackets what counts as the pattern. So few waves do not come to 1, and turned by some "
+        "angles three waves of squares do not count, without a fault as they are.",
         "",
-        *markdown_table(("pattern", "waves across", "Q2", "Q4", "Q6"), rows),
+        *markdown_table(
+            ("pattern", "waves across", "turned by", "Q2", "Q4", "Q6"),
+            [row for record in shown for row in _faultless_rows(record)],
+        ),
         "",
     )
+
+
+def _faultless_rows(record: PatternRecord) -> Iterator[tuple[str, ...]]:
+    """A pattern without a fault in any way and as the last map lies, and that map."""
+    pattern, side, limits = record.pattern, record.side, THRESHOLDS[record.pattern]
+    last = record.tenths - 1
+    found, fold = record.measures[last], 2 * DIRECTIONS[pattern]
+    turn = found.turns[fold]
+    lies = f"{round(np.degrees(turn)) % (360 // fold)}°"
+    names = ("Q2", "Q4", "Q6")
+    bounds = [f" ({_limit(*limits[name])})" if name in limits else "" for name in names]
+    waves = f"{side / (PUBLISHED[pattern].wavelength or np.nan):.1f}"
+    for angle, words in ((None, "any angle"), (turn, lies)):
+        ranges = faultless_measures(pattern, side, angle)
+        between = (f"{least:.2f} - {most:.2f}" for least, most in (ranges[name] for name in names))
+        marks = bounds if angle is None else ["", "", ""]
+        yield pattern, waves, words, *(text + mark for text, mark in zip(between, marks, strict=True))
+    here = (f"{named_measures(found)[name]:.2f}" for name in names)
+    yield f"{pattern}, here at cycle {record.cycles[last]}", "", lies, *here
 
 
 def _numbers(found: Pattern) -> Iterator[str]:

@@ -178,20 +178,21 @@ TURNS, SHIFTS = 19, 4
 
 
 @cache
-def faultless_measures(pattern: str, side: float) -> dict[str, tuple[float, float]]:
-    """Least and largest Q2, Q4, Q6 of a pattern without a fault, however it lies in the box.
+def faultless_measures(pattern: str, side: float, turn: float | None = None) -> dict[str, tuple[float, float]]:
+    """Least and largest Q2, Q4, Q6 of a pattern without a fault, however it is displaced.
 
     Few waves, seen through the window of the recipe, do not come to 1.
 
     Args:
         pattern: of `DIRECTIONS`; its waves are as long as on the published panel.
         side: of the box [D].
+        turn: of its waves against the walls [rad]; None: any.
     """
     wavelength, directions = PUBLISHED[pattern].wavelength, DIRECTIONS[pattern]
     assert wavelength is not None
     maps = (
-        faultless_map(directions, side / wavelength, turn, shift)
-        for turn in np.linspace(0.0, np.pi / directions, TURNS)
+        faultless_map(directions, side / wavelength, angle, shift)
+        for angle in (np.linspace(0.0, np.pi / directions, TURNS) if turn is None else [turn])
         for shift in np.arange(SHIFTS) / SHIFTS
     )
     found = [measure_pattern(heights, side) for heights in maps]

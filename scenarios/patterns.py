@@ -20,7 +20,8 @@ is up has another symmetry than what is down, while squares and stripes show the
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.ndimage import center_of_mass, gaussian_filter, label, maximum_filter
@@ -66,6 +67,8 @@ class Pattern:
     """ψ4, order of four neighbors about the peaks (or the cells); NaN where there are too few."""
     psi6: float
     """ψ6, of six neighbors."""
+    turns: Mapping[int, float] = field(default_factory=dict)
+    """m → how far waves of m-fold order are turned against the first axis [rad], in [0, 2π/m)."""
 
 
 def height_map(place: Floats, side: float) -> Floats:
@@ -115,12 +118,14 @@ def measure_pattern(heights: Floats, side: float) -> Pattern:
     strongest = int(np.argmax(strength[1:])) + 1
     inside = shell == strongest
     angle, weight = np.arctan2(ky[inside], kx[inside]), power[inside]
-    q2, q4, q6 = (float(np.abs((weight * np.exp(1j * m * angle)).sum() / (weight.sum() or 1.0))) for m in (2, 4, 6))
+    order = {m: (weight * np.exp(1j * m * angle)).sum() / (weight.sum() or 1.0) for m in (2, 4, 6)}
+    q2, q4, q6 = (float(np.abs(of_m)) for of_m in order.values())
+    turns = {m: float(np.angle(of_m) % (2.0 * np.pi) / m) for m, of_m in order.items()}
     total = float(power.sum())
     skewness = float(skew(smooth, axis=None)) if np.ptp(smooth) > FLAT * np.abs(smooth).max() else 0.0
     psi4, psi6 = _bond_order(filled if skewness >= 0.0 else -filled, len(filled) / strongest)
     share = float(strength[strongest]) / (total or 1.0)
-    return Pattern(side / strongest, share, float(smooth.std()), q2, q4, q6, skewness, psi4, psi6)
+    return Pattern(side / strongest, share, float(smooth.std()), q2, q4, q6, skewness, psi4, psi6, turns)
 
 
 def _bond_order(heights: Floats, wavelength: float) -> tuple[float, float]:

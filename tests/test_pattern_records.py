@@ -84,7 +84,8 @@ def test_the_page_sets_each_run_beside_the_published_panel() -> None:
     assert "| flat | here | 10 | 25.0 |" in page
     assert "none is expected" in page
     assert "| Zhang 2015 | 13 / 46 / 1 | 0.28 / 2.74 |" in page
-    assert "| squares | 3.0 | 0.00 - 0.01 (< 0.1) | 0.58 - 0.85 (> 0.75) |" in page
+    assert "| squares | 3.0 | any angle | 0.00 - 0.01 (< 0.1) | 0.58 - 0.85 (> 0.75) |" in page
+    assert "| squares, here at cycle 10 |  | 0° | 0.00 |" in page
     assert "## Patterns without a fault" not in patterns_markdown([record("flat", waves(1))])
 
 

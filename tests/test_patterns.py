@@ -56,6 +56,13 @@ def test_three_waves_of_squares_pass_only_where_they_lie_well() -> None:
     assert measure_pattern(faultless_map(2, 10.0, 0.0), SIDE).q4 > 0.95
 
 
+@pytest.mark.parametrize(("directions", "turn"), [(1, 0.4), (2, 0.0), (2, 0.3), (2, 1.2), (3, 0.7)])
+def test_the_turn_of_the_waves_is_found(directions: int, turn: float) -> None:
+    found = measure_pattern(faultless_map(directions, 6.0, turn), SIDE).turns[2 * directions]
+    period = np.pi / directions
+    assert (found - turn + 0.5 * period) % period == pytest.approx(0.5 * period, abs=0.03)
+
+
 def test_a_shift_of_a_wavelength_changes_nothing() -> None:
     here, there = (faultless_map(1, 4.0, 0.0, shift) for shift in (0.0, 1.0))
     assert there == pytest.approx(here, abs=1e-12)
