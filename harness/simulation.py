@@ -13,10 +13,14 @@ A run that is interrupted, or that fails, keeps all steps that it made; the same
 from __future__ import annotations
 
 import math
+import signal
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from types import FrameType
 
 import numpy as np
 import pandas as pd
@@ -209,13 +213,42 @@ def _run(
         try:
             if _is_probed(world, schedule):
                 probes.take(world)
-            report = recorder.step(ahead)
+            with _uninterrupted():
+                report = recorder.step(ahead)
         except (ProblemError, UnsupportedProblem, InvalidSolution) as error:
             raise SimulationError(f"step {world.steps + 1}: {error}") from error
         on_step(State(report, schedule.steps, recorder.measures, recorder.energy_unit))
         if recorder.measured_now and until(recorder.measures):
             return f"what was waited for holds at step {world.steps}"
     return f"all {schedule.steps} steps are made"
+
+
+@contextmanager
+def _uninterrupted() -> Iterator[None]:
+    """Hold an interruption back to the end: a world halfway through a step must not become a checkpoint.
+
+    A second interruption is not held back.
+    """
+    asked = False
+
+    def hold(number: int, frame: FrameType | None) -> None:
+        nonlocal asked
+        if asked:
+            signal.default_int_handler(number, frame)
+        asked = True
+
+    # Only the main thread has signals, and only those that would interrupt are held.
+    main = threading.current_thread() is threading.main_thread()
+    held = [s for s in (signal.SIGINT, signal.SIGTERM) if main and signal.getsignal(s) is signal.default_int_handler]
+    for number in held:
+        signal.signal(number, hold)
+    try:
+        yield
+    finally:
+        for number in held:
+            signal.signal(number, signal.default_int_handler)
+    if asked:
+        raise KeyboardInterrupt
 
 
 def _is_probed(world: MovingWorld, schedule: Schedule) -> bool:

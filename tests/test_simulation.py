@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import signal
+import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +27,7 @@ from reports.layers import layers_lines, read_layers
 from reports.runs import numbers
 from reports.simulation import simulation_markdown, write_simulation
 from scenarios.world.impact import Streamed
+from scenarios.world.stepping import StepReport, World
 from solvers import SOLVERS, ImpactProblem, ImpactSolution, Solver
 
 SMALL = "extended-pattern:side=4,steps_per_cycle=300"
@@ -86,6 +89,31 @@ def test_an_interrupted_run_goes_on_bit_for_bit(step: int, whole: Path, tmp_path
     with pytest.raises(KeyboardInterrupt):
         go(tmp_path, small(), on_step=interrupt_at(step))
     assert len(read_table(tmp_path / STEPS)) == step
+    go(tmp_path, small())
+    assert kept(tmp_path) == kept(whole)
+
+
+@pytest.mark.skipif(threading.current_thread() is not threading.main_thread(), reason="signals go to the main thread")
+@pytest.mark.parametrize("times", [1, 2])
+def test_an_interruption_waits_for_the_step_in_progress_and_a_second_one_does_not(
+    times: int, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # In a compiled call, or between two lines of a step, it would leave the world halfway.
+    step = World.step
+
+    def interrupted(world: World) -> StepReport:
+        if world.steps == 20:
+            for _ in range(times):
+                signal.raise_signal(signal.SIGINT)
+        return step(world)
+
+    monkeypatch.setattr(World, "step", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        go(tmp_path, small())
+    assert len(read_table(tmp_path / STEPS)) == (21 if times == 1 else 20)
+    # Afterwards an interruption is what it was.
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    monkeypatch.undo()
     go(tmp_path, small())
     assert kept(tmp_path) == kept(whole)
 
