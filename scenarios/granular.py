@@ -173,7 +173,8 @@ THRESHOLDS: dict[str, Mapping[str, tuple[float, float]]] = {
 
 DIRECTIONS = {"squares": 2, "stripes": 1, "hexagons": 3}
 """Pattern → directions of the standing waves that it is made of."""
-# A faultless pattern is turned and displaced in so many steps, as far as it repeats itself.
+# A faultless pattern is turned and displaced in so many steps, as far as it repeats itself: by 5° for squares, and by
+# quarters of a wavelength.
 TURNS, SHIFTS = 19, 4
 
 

@@ -75,8 +75,6 @@ class Constant:
 
     def of(self, speed: Floats) -> Floats:
         """c_r for speeds ≥ 0 [m/s], shape (m,)."""
-        if self.resting == 0.0:
-            return np.full(speed.shape, self.value)
         return np.where(speed < self.resting, 0.0, self.value)
 
 
