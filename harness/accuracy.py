@@ -106,12 +106,12 @@ def natural_map(problem: ImpactProblem, solution: ImpactSolution, target: Floats
 
 
 def tangent_map(problem: ImpactProblem, solution: ImpactSolution) -> float:
-    """Residual of the friction rows, |λ_f| ≤ μ λ opposing D v⁺, as a velocity over the largest |u⁻|."""
+    """Residual of the friction rows, |λ_f| ≤ μ λ opposing D v⁺ + β₀ D v⁻, as a velocity over the largest |u⁻|."""
     if solution.impulse is None or solution.friction_impulse is None or problem.D is None:
         return 0.0
     diagonal = np.asarray(problem.DM.multiply(problem.D).sum(axis=1), dtype=np.float64).reshape(-1)
     bound = np.repeat(problem.friction * np.maximum(solution.impulse, 0.0), 2)
-    slip = problem.D @ problem.v_after(solution.impulse, solution.friction_impulse)
+    slip = problem.D @ problem.v_after(solution.impulse, solution.friction_impulse) - problem.slip_target
     step = solution.friction_impulse * diagonal - slip
     projected = np.clip(step, -bound * diagonal, bound * diagonal)
     residual = (solution.friction_impulse * diagonal - projected)[diagonal > 0]

@@ -68,7 +68,7 @@ RAISED = (
 )  # fmt: skip
 # Arrays of a problem that a solver could write to.
 TAMPERED = ("J", "W", "JM", "JT", "MJT", "inverse_mass")
-TAMPERED_VECTORS = ("v_pre", "u_pre", "restitution", "friction", "stiffness", "W_diagonal")
+TAMPERED_VECTORS = ("v_pre", "u_pre", "restitution", "friction", "stiffness", "tangential_restitution", "W_diagonal")
 
 
 def check_solver(solver: Solver) -> None:
@@ -109,6 +109,7 @@ def solver_checks(solver: Solver) -> Iterator[tuple[str, Callable[[], None]]]:
     for restitution in (0.0, 0.5, 1.0):
         yield _name(7, f"one ball, restitution {restitution:g}"), partial(check_restitution, solver, restitution)
     yield _name(7, "sliding ball, friction 0.5"), partial(check_friction, solver)
+    yield _name(7, "ball that sticks, tangential restitution 0.5"), partial(check_tangential_restitution, solver)
     yield _name(7, "all elastic problems"), partial(check_applies_to_something, solver, elastic)
 
 
@@ -169,6 +170,7 @@ def special_problems() -> dict[str, ImpactProblem]:
         "stiffness for each contact": ImpactProblem(np.ones(4), J, v_pre, stiffness=[1.0, 10.0, 0.1]),
         "friction": disc,
         "friction and restitution": disc.replace(restitution=0.5),
+        "friction and tangential restitution": disc.replace(tangential_restitution=0.5),
     }
 
 
@@ -319,6 +321,22 @@ def check_friction(solver: Solver) -> None:
         return
     if not solution.v_post[0] <= 3.0 * (1.0 - SLIDING):
         _broken(7, name, "the ball slides as fast as before: a law without friction must refuse friction > 0")
+
+
+def check_tangential_restitution(solver: Solver) -> None:
+    """Point 7: a tangential restitution is answered or refused, never ignored: what sticks parts with its share."""
+    name, share = "ball that sticks, tangential restitution 0.5", 0.5
+    J, D, v_pre = [[0.0, 0.0, 1.0]], [[1, 0, 0], [0, 1, 0]], [1.0, 0.0, -1.0]
+    problem = ImpactProblem(np.ones(3), J, v_pre, 1.0, friction=2.0, D=D, tangential_restitution=share)
+    solution = _solve(solver, 7, name, problem)
+    if solution is None or solution.status is not Status.CONVERGED:
+        return
+    error = abs(float(solution.v_post[0]) + share)
+    if not error <= RESTITUTION_TOLERANCE:
+        _broken(
+            7, name, f"it slides at {solution.v_post[0]:.3g}, not {-share:g}: a law without tangential "
+            "restitution must refuse it",
+        )  # fmt: skip
 
 
 def check_applies_to_something(solver: Solver, problems: Mapping[str, ImpactProblem]) -> None:

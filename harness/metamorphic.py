@@ -57,6 +57,7 @@ def renumbered(problem: ImpactProblem, contacts: Indices, velocities: Indices) -
         problem.friction[contacts],
         None if problem.D is None else problem.D[_friction_rows(contacts)][:, velocities],
         problem.stiffness[contacts],
+        problem.tangential_restitution[contacts],
     )
 
 
@@ -87,6 +88,7 @@ def in_coordinates(problem: ImpactProblem, R: Matrix) -> ImpactProblem:
         problem.friction,
         None if problem.D is None else problem.D @ R.T,
         problem.stiffness,
+        problem.tangential_restitution,
     )
 
 
@@ -115,6 +117,7 @@ def with_bystander(problem: ImpactProblem, *, velocity: float) -> ImpactProblem:
         problem.friction,
         None if problem.D is None else sp.hstack([sp.csr_array((2 * problem.m, 1)), problem.D], format="csr"),
         problem.stiffness,
+        problem.tangential_restitution,
     )
 
 
@@ -131,6 +134,7 @@ def duplicated(problem: ImpactProblem, contact: int, *, stiffness_share: float) 
         problem.friction[contacts],
         None if problem.D is None else problem.D[_friction_rows(contacts)],
         stiffness,
+        problem.tangential_restitution[contacts],
     )
 
 
@@ -152,6 +156,7 @@ def in_units(problem: ImpactProblem, *, mass: float = 1.0, speed: float = 1.0, g
         problem.friction,
         None if problem.D is None else problem.D * gap,
         problem.stiffness,
+        problem.tangential_restitution,
     )
 
 

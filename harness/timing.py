@@ -115,7 +115,7 @@ def unbuilt(problem: ImpactProblem) -> ImpactProblem:
     """Return the same problem without the matrices that it builds when they are first asked for."""
     return ImpactProblem(
         problem.inverse_mass, problem.J, problem.v_pre, problem.restitution, problem.friction, problem.D,
-        problem.stiffness,
+        problem.stiffness, problem.tangential_restitution,
     )  # fmt: skip
 
 

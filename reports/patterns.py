@@ -87,8 +87,9 @@ def patterns_markdown(records: Sequence[PatternRecord]) -> str:
         "`scenarios/patterns.py` says. Published: the panels of Bizon et al. 1998 by the same measure; \"cycles\" is "
         "when a run of the first author showed the pattern. Lengths are in mean diameters D of a grain.",
         "",
-        "Settings are those of Bizon et al. 1998, but for the tangential restitution of contacts that stick: 0.35 "
-        "there, and 0 here (as in Zhang 2015) where the command of a run does not say `tangential_restitution`.",
+        "Settings are those of Bizon et al. 1998 where the command of a run does not say otherwise; among them a "
+        "tangential restitution of 0.35 of contacts that stick, which Zhang 2015 does not have. A command that does "
+        "not name it was run with 0.",
         "",
         "Q2, Q4 and Q6 are the published recipe: order of the whole map. ψ4 and ψ6 are the order about each peak away "
         "from the walls (1 for four, or six, neighbors at equal angles; about 0.5 both for few peaks at random). "

@@ -1,12 +1,12 @@
 """Contact LCPs, without and with friction: the numerical core that several laws share.
 
     0 <= λ    complementary to  J v - target >= 0          normal rows
-    |λ_f| <= μ λ, opposing      D v                        friction pyramid (boxed LCP), two rows a contact
+    |λ_f| <= μ λ, opposing      D v + β₀ D v_pre           friction pyramid (boxed LCP), two rows a contact
     v = v_start + M⁻¹ (Jᵀ λ + Dᵀ λ_f)
 
-`sweep` is projected Gauss-Seidel, alternating one sweep over the normals with one over the tangents (Zhang 2015,
-Eq. 20-21; Stewart 1996, Tonge 2012), after proximal Newton steps where there is friction and the problem is small
-enough (see `projected_gauss_seidel`). `dissipate` solves the tangents alone, the normal impulses held (maximum
+`sweep` is projected Gauss-Seidel, alternating one sweep over the normals with one over the tangents (Zhang 2015, Eq.
+20-21; Stewart 1996, Tonge 2012; β₀: Walton 1993), after proximal Newton steps where there is friction and the problem
+is small enough (see `projected_gauss_seidel`). `dissipate` solves the tangents alone, the normal impulses held (maximum
 dissipation). `project` solves the frictionless problem to rounding. This file is their contract; the work is done in
 `projected_gauss_seidel` and `cone_projection`.
 

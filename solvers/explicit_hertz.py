@@ -78,7 +78,7 @@ from solvers.compression import pair_duration
 from solvers.explicit_hertz_rows import Rows, rows
 from solvers.explicit_hertz_spheres import Spheres, spheres
 from solvers.problem import ImpactProblem
-from solvers.solution import Floats, ImpactSolution, Status
+from solvers.solution import Floats, ImpactSolution, Status, UnsupportedProblem
 from solvers.sphere_chunks import SHARED_CONTACTS
 
 # Without gap memory, an approach slower than this part of the round's fastest waits for the next round, whose clock
@@ -127,7 +127,13 @@ class ExplicitHertz:
             raise ValueError(f"gap_memory must lie in [0, 1), not {self.gap_memory}")
 
     def solve(self, problem: ImpactProblem) -> ImpactSolution:
-        """Solve one multi-impact of any restitution and friction."""
+        """Solve one multi-impact of any restitution and friction.
+
+        Raises:
+            UnsupportedProblem: contacts with friction have a tangential restitution.
+        """
+        if problem.has_friction and problem.tangential_restitution.any():
+            raise UnsupportedProblem("ehi's friction gives nothing back: tangential_restitution must be 0")
         V = -float(problem.u_pre.min(initial=0.0))
         if self.tolerance * problem.speed >= V:
             run = _Run(problem.v_pre, -V, np.zeros(problem.m), np.zeros(0), 0, problem.m, True)

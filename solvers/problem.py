@@ -16,6 +16,7 @@ D       D                   (2m, n)   friction pyramid directions, rows 2i and 2
 μ       friction            (m,)      coefficient of friction
 c_r     restitution         (m,)      coefficient of restitution, in [0, 1]
 k       stiffness           (m,)      relative contact stiffness; only ratios matter, read by compliant laws alone
+β₀      tangential_restitution  (m,)  what sticks parts with -β₀ D v_pre, in [0, 1] (Walton 1993); 0 in most laws
 """
 
 from __future__ import annotations
@@ -60,6 +61,7 @@ class ImpactProblem:
         friction: coefficient of friction ≥ 0, a number or shape (m,).
         D: friction pyramid directions, shape (2m, n); needed where friction > 0.
         stiffness: relative contact stiffness > 0, a number or shape (m,).
+        tangential_restitution: β₀ in [0, 1], a number or shape (m,); it has no effect without friction.
 
     Raises:
         ProblemError: names the field and the rule that it breaks.
@@ -74,6 +76,7 @@ class ImpactProblem:
         friction: npt.ArrayLike = 0.0,
         D: MatrixLike | None = None,
         stiffness: npt.ArrayLike = 1.0,
+        tangential_restitution: npt.ArrayLike = 0.0,
     ) -> None:
         self.v_pre: Floats = _vector("v_pre", v_pre)
         self.J: Matrix = _matrix("J", J)
@@ -81,6 +84,7 @@ class ImpactProblem:
         self.restitution: Floats = _restitution(restitution, m)
         self.friction: Floats = _friction(friction, m)
         self.stiffness: Floats = _stiffness(stiffness, m)
+        self.tangential_restitution: Floats = _restitution(tangential_restitution, m, "tangential_restitution")
         self.D: Matrix | None = None if D is None else _matrix("D", D)
         if self.D is not None and self.D.shape != (2 * m, n):
             raise ProblemError(f"D must have shape (2m, n) = ({2 * m}, {n}), not {self.D.shape}")
@@ -126,13 +130,14 @@ class ImpactProblem:
         restitution: npt.ArrayLike | None = None,
         friction: npt.ArrayLike | None = None,
         stiffness: npt.ArrayLike | None = None,
+        tangential_restitution: npt.ArrayLike | None = None,
     ) -> ImpactProblem:
         """Return the same bodies and contacts with other numbers; nothing that these leave alone is computed again."""
         other = object.__new__(ImpactProblem)
         other.__dict__.update(self.__dict__)
         if v_pre is not None:
             other.v_pre = _vector("v_pre", v_pre)
-            other._forget("u_pre", "speed")
+            other._forget("u_pre", "speed", "slip_target")
         if restitution is not None:
             other.restitution = _restitution(restitution, self.m)
         if friction is not None:
@@ -140,6 +145,9 @@ class ImpactProblem:
             other._forget("has_friction")
         if stiffness is not None:
             other.stiffness = _stiffness(stiffness, self.m)
+        if tangential_restitution is not None:
+            other.tangential_restitution = _restitution(tangential_restitution, self.m, "tangential_restitution")
+            other._forget("slip_target")
         other._check_together()
         return other
 
@@ -225,6 +233,13 @@ class ImpactProblem:
         return float(np.abs(self.u_pre).max(initial=0.0))
 
     @cached_property
+    def slip_target(self) -> Floats:
+        """Velocity along D of what sticks after the impact, -β₀ D v_pre [m/s], shape (2m,) (Walton 1993)."""
+        if self.D is None or not self.tangential_restitution.any():
+            return _frozen(np.zeros(2 * self.m))
+        return _frozen(-np.repeat(self.tangential_restitution, 2) * (self.D @ self.v_pre))
+
+    @cached_property
     def has_friction(self) -> bool:
         """True where any contact has friction > 0."""
         return bool((self.friction > 0).any())
@@ -278,10 +293,10 @@ def _per_contact(field: str, value: npt.ArrayLike, m: int) -> Floats:
     return _frozen(array.copy())
 
 
-def _restitution(value: npt.ArrayLike, m: int) -> Floats:
-    restitution = _per_contact("restitution", value, m)
+def _restitution(value: npt.ArrayLike, m: int, field: str = "restitution") -> Floats:
+    restitution = _per_contact(field, value, m)
     if m and (restitution.min() < 0 or restitution.max() > 1):
-        raise ProblemError(f"restitution must lie in [0, 1]: {_worst(restitution, 0.0, 1.0)}")
+        raise ProblemError(f"{field} must lie in [0, 1]: {_worst(restitution, 0.0, 1.0)}")
     return restitution
 
 

@@ -1,7 +1,7 @@
 """Projected Gauss-Seidel for contacts with friction, matrix-free: one row after the other, each to its own optimum.
 
     λ ← max(0, λ - (J v - target) / W_ii)                                normals
-    λ_f ← min(max(λ_f - D v / (D M⁻¹ Dᵀ)_kk, -μ λ), μ λ)                 tangents
+    λ_f ← min(max(λ_f - (D v + β₀ D v_pre) / (D M⁻¹ Dᵀ)_kk, -μ λ), μ λ)  tangents
 
 v follows every step, so that a visit touches the velocities of one contact and never a row of W. Normals come in two
 forms: packed where the problem is of spheres (`sphere_rows`: 32 bytes a contact, neighbors in space are neighbors in
@@ -146,8 +146,8 @@ def _swept(
     found, found_friction = impulse[order], friction_impulse[tangent_order]
     v, sweeps, visits, residual = _sweep(
         *_normals(problem, rows), *_tangents(problem, rows), problem.W_diagonal[order], problem.friction[order],
-        problem.v_pre.copy() if rows is None else rows.V.ravel(), target[order], found, found_friction,
-        tolerance, max_sweeps, max_visits,
+        problem.v_pre.copy() if rows is None else rows.V.ravel(), target[order], problem.slip_target[tangent_order],
+        found, found_friction, tolerance, max_sweeps, max_visits,
     )  # fmt: skip
     impulse[order], friction_impulse[tangent_order] = found, found_friction
     velocity = v if rows is None else rows.velocity_in_problem_order(v.reshape(-1, STRIDE), problem.n)
@@ -172,7 +172,7 @@ def dissipate(
     """
     friction_impulse = np.zeros(2 * problem.m)
     v, sweeps, visits, residual = _dissipate(
-        *_tangents(problem, None), problem.friction, v_start.copy(), impulse, friction_impulse,
+        *_tangents(problem, None), problem.friction, problem.slip_target, v_start.copy(), impulse, friction_impulse,
         tolerance, max_sweeps, max_visits,
     )  # fmt: skip
     return friction_impulse, v, sweeps, visits, residual
@@ -302,9 +302,12 @@ def _normal_sweep(
 @kernel
 def _tangent_sweep(
     D_start: Ints, D_index: Indices, D: Floats, DM_start: Ints, DM_index: Indices, DM: Floats,
-    diagonal: Floats, mu: Floats, impulse: Floats, friction_impulse: Floats, v: Floats,
+    diagonal: Floats, mu: Floats, slip: Floats, impulse: Floats, friction_impulse: Floats, v: Floats,
 ) -> float:  # fmt: skip
-    """One projected sweep over the tangents, |λ_f| ≤ μ λ; returns the largest velocity change that it made."""
+    """One projected sweep over the tangents, |λ_f| ≤ μ λ; returns the largest velocity change that it made.
+
+    `slip`: velocity along each tangent of what sticks afterwards.
+    """
     change = 0.0
     for i in range(mu.size):
         if mu[i] == 0.0:
@@ -313,7 +316,7 @@ def _tangent_sweep(
         for row in range(2 * i, 2 * i + 2):
             if diagonal[row] <= 0.0:
                 continue
-            wanted = friction_impulse[row] - _row(D_start, D_index, D, row, v) / diagonal[row]
+            wanted = friction_impulse[row] - (_row(D_start, D_index, D, row, v) - slip[row]) / diagonal[row]
             step = min(max(wanted, -bound), bound) - friction_impulse[row]
             if step != 0.0:
                 friction_impulse[row] += step
@@ -325,7 +328,7 @@ def _tangent_sweep(
 @kernel
 def _tangent_residual(
     D_start: Ints, D_index: Indices, D: Floats,
-    diagonal: Floats, mu: Floats, impulse: Floats, friction_impulse: Floats, v: Floats,
+    diagonal: Floats, mu: Floats, slip: Floats, impulse: Floats, friction_impulse: Floats, v: Floats,
 ) -> float:  # fmt: skip
     """Natural map of the tangents [m/s]."""
     residual = 0.0
@@ -336,7 +339,7 @@ def _tangent_residual(
         for row in range(2 * i, 2 * i + 2):
             if diagonal[row] <= 0.0:
                 continue
-            wanted = friction_impulse[row] - _row(D_start, D_index, D, row, v) / diagonal[row]
+            wanted = friction_impulse[row] - (_row(D_start, D_index, D, row, v) - slip[row]) / diagonal[row]
             step = min(max(wanted, -bound), bound) - friction_impulse[row]
             residual = max(residual, abs(step) * diagonal[row])
     return residual
@@ -363,7 +366,8 @@ def _sweep(
     normal: Floats, body: Indices,
     J_start: Ints, J_index: Indices, J: Floats, JM_start: Ints, JM_index: Indices, JM: Floats,
     D_start: Ints, D_index: Indices, D: Floats, DM_start: Ints, DM_index: Indices, DM: Floats,
-    W_diagonal: Floats, mu: Floats, v_pre: Floats, target: Floats, impulse: Floats, friction_impulse: Floats,
+    W_diagonal: Floats, mu: Floats, v_pre: Floats, target: Floats, slip: Floats, impulse: Floats,
+    friction_impulse: Floats,
     tolerance: float, max_sweeps: int, max_visits: int,
 ) -> tuple[Floats, int, int, float]:  # fmt: skip
     """Sweeps from given impulses (changed in place); returns v, sweeps, visits, natural map [m/s]."""
@@ -395,8 +399,8 @@ def _sweep(
                 u = _gap_rate(normal, body, i, v) if packed else _row(J_start, J_index, J, i, v)
                 residual = max(residual, abs(min(u - target[i], impulse[i] * W_diagonal[i])))
             if frictional > 0:
-                slip = _tangent_residual(D_start, D_index, D, diagonal, mu, impulse, friction_impulse, v)
-                residual = max(residual, slip)
+                left = _tangent_residual(D_start, D_index, D, diagonal, mu, slip, impulse, friction_impulse, v)
+                residual = max(residual, left)
             visits += m + 2 * frictional
             if residual <= tolerance or bounded:
                 return v, sweeps, visits, residual
@@ -404,10 +408,10 @@ def _sweep(
             normal, body, J_start, J_index, J, JM_start, JM_index, JM, W_diagonal, target, impulse, v
         )
         if frictional > 0:
-            slip = _tangent_sweep(
-                D_start, D_index, D, DM_start, DM_index, DM, diagonal, mu, impulse, friction_impulse, v
+            step = _tangent_sweep(
+                D_start, D_index, D, DM_start, DM_index, DM, diagonal, mu, slip, impulse, friction_impulse, v
             )
-            change = max(change, slip)
+            change = max(change, step)
         sweeps += 1
         visits += m + 2 * frictional
 
@@ -415,7 +419,8 @@ def _sweep(
 @kernel
 def _dissipate(
     D_start: Ints, D_index: Indices, D: Floats, DM_start: Ints, DM_index: Indices, DM: Floats, mu: Floats,
-    v: Floats, impulse: Floats, friction_impulse: Floats, tolerance: float, max_sweeps: int, max_visits: int,
+    slip: Floats, v: Floats, impulse: Floats, friction_impulse: Floats, tolerance: float, max_sweeps: int,
+    max_visits: int,
 ) -> tuple[Floats, int, int, float]:  # fmt: skip
     """Sweeps over the tangents alone (λ_f and v changed); returns v, sweeps, visits, natural map [m/s]."""
     diagonal = _tangent_diagonal(D_start, D_index, D, DM_start, DM_index, DM, v.size)
@@ -423,8 +428,8 @@ def _dissipate(
     visits = 0
     residual = np.inf
     while residual > tolerance and sweeps < max_sweeps and visits < max_visits:
-        _tangent_sweep(D_start, D_index, D, DM_start, DM_index, DM, diagonal, mu, impulse, friction_impulse, v)
-        residual = _tangent_residual(D_start, D_index, D, diagonal, mu, impulse, friction_impulse, v)
+        _tangent_sweep(D_start, D_index, D, DM_start, DM_index, DM, diagonal, mu, slip, impulse, friction_impulse, v)
+        residual = _tangent_residual(D_start, D_index, D, diagonal, mu, slip, impulse, friction_impulse, v)
         sweeps += 1
         visits += 4 * mu.size
     return v, sweeps, visits, residual

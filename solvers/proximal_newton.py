@@ -1,12 +1,12 @@
 """Contacts with friction where sweeps creep: proximal steps, each solved by Newton's method on the rows that hold.
 
-    x ← the x with   0 <= λ complementary to  u + ε diag(W) (x - c) >= 0,   |λ_f| <= μ λ opposing D v + ε diag (x - c)
+    x ← the x with   0 <= λ complementary to  u + ε diag(W) (x - c) >= 0,   |λ_f| <= μ λ opposing w + ε diag (x - c)
 
-x = (λ, λ_f), u = J v - target, v = v_pre + M⁻¹(Jᵀ λ + Dᵀ λ_f), c the iterate before. The problem itself is ε = 0. A
-box bounds friction along each axis by itself: where a face slides and turns, the second axis of its corners has to
-reach its bound too, along impulses that cancel one another and change no velocity. A sweep goes that way by a fixed
-small step, thousands of times; a proximal step goes 1/ε as far, and leaves a regular system where contacts are
-redundant.
+x = (λ, λ_f), u = J v - target, w = D v + β₀ D v_pre, v = v_pre + M⁻¹(Jᵀ λ + Dᵀ λ_f), c the iterate before. The problem
+itself is ε = 0. A box bounds friction along each axis by itself: where a face slides and turns, the second axis of its
+corners has to reach its bound too, along impulses that cancel one another and change no velocity. A sweep goes that way
+by a fixed small step, thousands of times; a proximal step goes 1/ε as far, and leaves a regular system where contacts
+are redundant.
 
 Newton's method takes the rows as they are at an iterate: normals that push and tangents within their bounds hold, the
 others slide at ± μ λ with λ unknown, or are open (primal-dual active set: Hintermüller, Ito and Kunisch 2002). With
@@ -106,7 +106,7 @@ def proximal_step(
     center = np.column_stack([impulse, friction_impulse.reshape(-1, 2)])
     best, solved, iterations = _proximal(
         *_parts(problem.J), *_parts(_tangents(problem)), *_parts(problem.JM), *_parts(problem.DM),
-        problem.W_diagonal, problem.friction, problem.v_pre, target, center,
+        problem.W_diagonal, problem.friction, problem.v_pre, target, problem.slip_target, center,
         elimination.order, elimination.start, elimination.later, elimination.slot, epsilon, SHARE * tolerance,
     )  # fmt: skip
     return best[:, 0].copy(), best[:, 1:].ravel(), solved, iterations
@@ -386,13 +386,14 @@ def _velocity(
 @kernel
 def _gradient(
     J_start: Ints, J_column: Indices, J: Floats, D_start: Ints, D_column: Indices, D: Floats,
-    diagonal: Floats, target: Floats, center: Floats, epsilon: float, x: Floats, v: Floats, u: Floats,
+    diagonal: Floats, target: Floats, slip: Floats, center: Floats, epsilon: float, x: Floats, v: Floats, u: Floats,
 ) -> None:  # fmt: skip
     """Relative velocities of all rows with the proximal term, shape (m, 3)."""
     for i in range(target.size):
         u[i, 0] = _row(J_start, J_column, J, i, v) - target[i]
         for k in range(1, 3):
-            u[i, k] = _row(D_start, D_column, D, 2 * i + k - 1, v) if diagonal[i, k] > 0.0 else 0.0
+            row = 2 * i + k - 1
+            u[i, k] = _row(D_start, D_column, D, row, v) - slip[row] if diagonal[i, k] > 0.0 else 0.0
         for k in range(3):
             u[i, k] += epsilon * diagonal[i, k] * (x[i, k] - center[i, k])
 
@@ -417,7 +418,8 @@ def _natural_map(diagonal: Floats, mu: Floats, epsilon: float, x: Floats, u: Flo
 def _newton(
     J_start: Ints, J_column: Indices, J: Floats, D_start: Ints, D_column: Indices, D: Floats,
     JM_start: Ints, JM_column: Indices, JM: Floats, DM_start: Ints, DM_column: Indices, DM: Floats,
-    diagonal: Floats, mu: Floats, v_pre: Floats, target: Floats, center: Floats, act: Ints, sign: Floats,
+    diagonal: Floats, mu: Floats, v_pre: Floats, target: Floats, slip: Floats, center: Floats, act: Ints,
+    sign: Floats,
     order: Ints, start: Ints, later: Ints, slot: Ints, matrix: Floats, epsilon: float,
     x: Floats, u: Floats, v: Floats, change: Floats,
 ) -> None:  # fmt: skip
@@ -429,7 +431,7 @@ def _newton(
             if act[i, k] != HOLDS:
                 x[i, k] = sign[i, k] * mu[i] * x[i, 0]
     _velocity(JM_start, JM_column, JM, DM_start, DM_column, DM, v_pre, x, v)
-    _gradient(J_start, J_column, J, D_start, D_column, D, diagonal, target, center, epsilon, x, v, u)
+    _gradient(J_start, J_column, J, D_start, D_column, D, diagonal, target, slip, center, epsilon, x, v, u)
     matrix[:] = 0.0
     for block in range(order.size):
         for a in range(BLOCK):
@@ -459,8 +461,8 @@ def _newton(
         x[i, 0] -= (u[i, 0] + _row(J_start, J_column, J, i, change)) / (epsilon * diagonal[i, 0])
         for k in range(1, 3):
             if act[i, k] == HOLDS:
-                slip = u[i, k] + _row(D_start, D_column, D, 2 * i + k - 1, change)
-                x[i, k] -= slip / (epsilon * diagonal[i, k])
+                left = u[i, k] + _row(D_start, D_column, D, 2 * i + k - 1, change)
+                x[i, k] -= left / (epsilon * diagonal[i, k])
             else:
                 x[i, k] = sign[i, k] * mu[i] * x[i, 0]
 
@@ -469,7 +471,7 @@ def _newton(
 def _proximal(
     J_start: Ints, J_column: Indices, J: Floats, D_start: Ints, D_column: Indices, D: Floats,
     JM_start: Ints, JM_column: Indices, JM: Floats, DM_start: Ints, DM_column: Indices, DM: Floats,
-    W_diagonal: Floats, mu: Floats, v_pre: Floats, target: Floats, center: Floats,
+    W_diagonal: Floats, mu: Floats, v_pre: Floats, target: Floats, slip: Floats, center: Floats,
     order: Ints, start: Ints, later: Ints, slot: Ints, epsilon: float, tolerance: float,
 ) -> tuple[Floats, bool, int]:  # fmt: skip
     """Best impulses within their bounds, whether they solve the step, iterations."""
@@ -488,11 +490,11 @@ def _proximal(
     vain = 0
     for iteration in range(ITERATIONS):
         _velocity(JM_start, JM_column, JM, DM_start, DM_column, DM, v_pre, x, v)
-        _gradient(J_start, J_column, J, D_start, D_column, D, diagonal, target, center, epsilon, x, v, u)
+        _gradient(J_start, J_column, J, D_start, D_column, D, diagonal, target, slip, center, epsilon, x, v, u)
         _choose(diagonal, mu, epsilon, x, u, act, sign)
         _newton(
             J_start, J_column, J, D_start, D_column, D, JM_start, JM_column, JM, DM_start, DM_column, DM,
-            diagonal, mu, v_pre, target, center, act, sign, order, start, later, slot, matrix, epsilon,
+            diagonal, mu, v_pre, target, slip, center, act, sign, order, start, later, slot, matrix, epsilon,
             x, u, v, change,
         )  # fmt: skip
         for i in range(m):
@@ -501,7 +503,7 @@ def _proximal(
             for k in range(1, 3):
                 bounded[i, k] = min(max(x[i, k], -bound), bound)
         _velocity(JM_start, JM_column, JM, DM_start, DM_column, DM, v_pre, bounded, v)
-        _gradient(J_start, J_column, J, D_start, D_column, D, diagonal, target, center, epsilon, bounded, v, u)
+        _gradient(J_start, J_column, J, D_start, D_column, D, diagonal, target, slip, center, epsilon, bounded, v, u)
         violation = _natural_map(diagonal, mu, epsilon, bounded, u)
         vain = 0 if violation < PROGRESS * least else vain + 1
         if violation < least:

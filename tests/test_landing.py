@@ -129,7 +129,8 @@ def landing(
     """The layer a cycle later, with so many times as many steps."""
     steps = extended_pattern(pattern=pattern, side=SIDE).steps_per_cycle
     assert steps is not None
-    scene = extended_pattern(pattern=pattern, side=SIDE, steps_per_cycle=finer * steps)
+    # The soft spheres' friction ends slip and gives nothing back.
+    scene = extended_pattern(pattern=pattern, side=SIDE, steps_per_cycle=finer * steps, tangential_restitution=0.0)
     world = scene.world(solver="qce-lcp-fast", seed=0)
     assert isinstance(world, World)
     motion = world.spheres.motion.copy()

@@ -7,7 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from solvers import SOLVERS, ImpactProblem, Status, UnsupportedProblem
+from harness import accuracy
+from solvers import SOLVERS, ImpactProblem, ProblemError, Status, UnsupportedProblem
 from solvers.quadratic_contact_energy import QuadraticContactEnergy, solve_elastic
 from solvers.solution import Floats
 
@@ -178,6 +179,37 @@ def test_friction_slides_by_mu_times_the_impulse_or_sticks(name: str, friction: 
     v = outcome(name, sliding_block(friction, slope))
     # Normal impulse 1.5; sliding takes μ 1.5 of the tangential speed, but never reverses it.
     np.testing.assert_allclose(v, [max(slope - 1.5 * friction, 0.0), 0.0, 0.5], atol=ITERATIVE)
+
+
+@pytest.mark.parametrize("name", ["lcp-pgs", "qce-lcp", "qce-blend", "gr"])
+@pytest.mark.parametrize(("friction", "slope"), [(0.2, 1.0), (0.2, 0.2), (0.2, 0.22), (1.0, 1.0), (0.0, 1.0)])
+def test_what_sticks_parts_with_its_tangential_restitution(name: str, friction: float, slope: float) -> None:
+    # Walton 1993, with no spin: friction takes μ 1.5 of the tangential speed, but never more than (1 + β₀) of it.
+    problem = sliding_block(friction, slope).replace(tangential_restitution=0.4)
+    np.testing.assert_allclose(problem.slip_target, [-0.4 * slope, 0.0])
+    v = outcome(name, problem)
+    expected = max(slope - 1.5 * friction, -0.4 * slope)
+    np.testing.assert_allclose(v, [expected, 0.0, 0.5], atol=ITERATIVE)
+    assert accuracy.tangent_map(problem, SOLVERS[name]().solve(problem)) <= ITERATIVE
+
+
+def test_tangential_restitution_follows_the_velocity_and_is_none_without_friction() -> None:
+    plain = sliding_block(0.2, 1.0)
+    assert not plain.slip_target.any()
+    bouncing = plain.replace(tangential_restitution=0.4)
+    faster = bouncing.replace(v_pre=3.0 * bouncing.v_pre)
+    np.testing.assert_allclose(faster.slip_target, 3.0 * bouncing.slip_target)
+    np.testing.assert_array_equal(
+        outcome("qce-lcp", bouncing.replace(friction=0.0)), outcome("qce-lcp", plain.replace(friction=0.0))
+    )
+    with pytest.raises(ProblemError, match=r"tangential_restitution must lie in \[0, 1\]: entry 0 is 1.5"):
+        plain.replace(tangential_restitution=1.5)
+
+
+def test_ehi_refuses_a_tangential_restitution() -> None:
+    problem = sliding_block(0.2, 1.0).replace(tangential_restitution=0.4)
+    with pytest.raises(UnsupportedProblem, match="tangential_restitution must be 0"):
+        SOLVERS["ehi"]().solve(problem)
 
 
 @pytest.mark.parametrize("name", ["qce", "qce-defer", "lcp-nnls", "gauss-seidel", "jacobi"])

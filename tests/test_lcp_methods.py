@@ -242,8 +242,12 @@ def with_friction(problem: ImpactProblem, *, spin: bool) -> ImpactProblem:
 
 
 @pytest.mark.parametrize("spin", [False, True])
-def test_packed_sweeps_with_friction_are_the_sweeps_of_sparse_rows(spin: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("rebound", [0.0, 0.35])
+def test_packed_sweeps_with_friction_are_the_sweeps_of_sparse_rows(
+    spin: bool, rebound: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
     problem = with_friction(sphere_pack(spheres=100, start="hot").problem, spin=spin)
+    problem = problem.replace(tangential_restitution=rebound)
     assert problem.m >= projected_gauss_seidel.PACKED
     target = np.zeros(problem.m)
     packed = sweep(problem, target, tolerance=0.0, max_sweeps=20)

@@ -89,12 +89,13 @@ def test_an_unbuilt_problem_has_the_same_numbers_and_no_matrices(problem: Impact
 
 
 def test_friction_directions_survive_being_unbuilt() -> None:
-    rubbing = CATALOG["bernoulli"](friction=0.3).problem
+    rubbing = CATALOG["bernoulli"](friction=0.3).problem.replace(tangential_restitution=0.35)
     fresh = unbuilt(rubbing)
     assert rubbing.D is not None
     assert fresh.D is not None
     np.testing.assert_array_equal(fresh.D.toarray(), rubbing.D.toarray())
     np.testing.assert_array_equal(fresh.friction, rubbing.friction)
+    np.testing.assert_array_equal(fresh.slip_target, rubbing.slip_target)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="resident memory is read from /proc")

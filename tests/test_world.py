@@ -49,10 +49,10 @@ def gas(count: int = 150, seed: int = 0, width: float = 5.0) -> Spheres:
 
 def shaken(
     resolver: Resolver, *, friction: float = 0.5, restitution: float | Restitution = 0.3, seed: int = 0,
-    step: float = 0.02,
+    step: float = 0.02, tangential_restitution: float = 0.0,
 ) -> World:  # fmt: skip
     law = Constant(restitution) if isinstance(restitution, float) else restitution
-    settings = Settings(step, 1.0, law, friction)
+    settings = Settings(step, 1.0, law, friction, tangential_restitution)
     return World("shaken", gas(seed=seed), box(5.0, 5.0, Vibration(0.5, 0.2)), settings, resolver)
 
 
@@ -157,9 +157,11 @@ def test_a_world_finds_all_contacts_while_its_list_lasts(monkeypatch: pytest.Mon
 
 
 @pytest.mark.parametrize("restitution", [0.3, SlowingRestitution()])
-@pytest.mark.parametrize("friction", [0.0, 0.5])
-def test_the_packed_way_and_the_problem_give_the_same_step(friction: float, restitution: float | Restitution) -> None:
-    world = shaken(Streamed(20_000, TIGHT), friction=friction, restitution=restitution)
+@pytest.mark.parametrize(("friction", "rebound"), [(0.0, 0.0), (0.5, 0.0), (0.5, 0.35)])
+def test_the_packed_way_and_the_problem_give_the_same_step(
+    friction: float, rebound: float, restitution: float | Restitution
+) -> None:
+    world = shaken(Streamed(20_000, TIGHT), friction=friction, restitution=restitution, tangential_restitution=rebound)
     compared = 0
     for _ in range(180):
         impact = world.impact()
@@ -339,10 +341,13 @@ def test_tangential_restitution_gives_a_layer_no_energy() -> None:
     assert max(report.gain for report in reports) <= ROUNDING
 
 
-def test_an_impact_with_tangential_restitution_is_no_problem_for_other_solvers() -> None:
-    world = extended_pattern(side=4, tangential_restitution=BIZON).world(solver=SOLVERS["qce-lcp"]())
-    with pytest.raises(UnsupportedProblem, match="tangential_restitution must be 0"):
+def test_a_pattern_has_the_tangential_restitution_of_bizon_for_all_laws() -> None:
+    world = extended_pattern(side=4).world(solver=SOLVERS["qce-lcp"]())
+    assert isinstance(world, World)
+    while world.impact().contacts.m == 0:
         world.step()
+    assert (world.problem().tangential_restitution == BIZON).all()
+    assert world.step().contacts > 0
     with pytest.raises(ProblemError, match="tangential_restitution"):
         extended_pattern(tangential_restitution=1.5)
 
@@ -657,6 +662,15 @@ def test_a_solver_that_refuses_friction_says_so() -> None:
 def test_an_unknown_solver_is_refused_with_the_names() -> None:
     with pytest.raises(ProblemError, match=r"solver must be one of .*qce-lcp-fast.*, not 'qcee'"):
         MOVING["extended-pattern"](side=6).world(solver="qcee")
+
+
+def test_a_packed_solver_takes_settings_by_name() -> None:
+    make = MOVING["extended-pattern"](side=6).world
+    world = make(solver="qce-lcp-fast:max_sweeps=9")
+    assert isinstance(world, World)
+    assert world.resolver == Streamed(max_sweeps=9)
+    with pytest.raises(ProblemError, match="solver must have settings such as"):
+        make(solver="qce-lcp-fast:sweeps=9")
 
 
 def test_streamed_settings_have_names_that_are_no_solvers() -> None:

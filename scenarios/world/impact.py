@@ -35,7 +35,7 @@ from scenarios.contacts import tangents_of
 from scenarios.world.grid import Contacts, Indices
 from scenarios.world.spheres import INVERSE_INERTIA, PARTS, Ints
 from scenarios.world.warm_start import NO_IMPULSES, LastImpulses, labels_of
-from solvers import ImpactProblem, Solver, Status, UnsupportedProblem
+from solvers import ImpactProblem, Solver, Status
 from solvers._jit import kernel, parallel_kernel, prange
 from solvers.buffers import Buffers
 from solvers.qce_stream import solve_spheres
@@ -188,15 +188,7 @@ class Impact:
         return {} if guess is None else {"start": guess[:, 0].copy(), "friction_start": guess[:, 1:].ravel()}
 
     def problem(self) -> ImpactProblem:
-        """The impact for any solver: blocks v of three a sphere, with friction blocks (v, s) of six.
-
-        Raises:
-            UnsupportedProblem: it has a tangential restitution, which an `ImpactProblem` cannot tell.
-        """
-        if self.tangential_restitution > 0.0:
-            raise UnsupportedProblem(
-                "tangential_restitution must be 0 here: only qce-lcp-fast and qce-lcp-accurate know of it"
-            )
+        """The impact for any solver: blocks v of three a sphere, with friction blocks (v, s) of six."""
         restitution = self.coefficient
         normal = self.contacts.normal
         if self.friction == 0.0:
@@ -217,7 +209,10 @@ class Impact:
         weight = np.array([1.0, 1.0, 1.0, *[INVERSE_INERTIA] * 3])
         velocity = np.hstack([self.motion[:-1, :3], self.motion[:-1, 4:7]])
         inverse = (self.motion[:-1, 3, None] * weight).ravel()
-        return ImpactProblem(inverse, J, velocity.ravel(), restitution, self.friction, D[in_pairs])
+        return ImpactProblem(
+            inverse, J, velocity.ravel(), restitution, self.friction, D[in_pairs],
+            tangential_restitution=self.tangential_restitution,
+        )  # fmt: skip
 
     def _rows(self, on_second: Floats, on_first: Floats) -> sp.csr_array:
         """Sparse rows from the blocks of the second body and, with a minus, of the first where that is movable."""

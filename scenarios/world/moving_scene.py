@@ -5,8 +5,9 @@ from __future__ import annotations
 import ast
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from typing import Protocol, TypeAlias
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Protocol, TypeAlias, TypeVar
 
 from scenarios.parameters import check_count
 from scenarios.world.checkpoint import Arrays
@@ -15,6 +16,8 @@ from scenarios.world.impact import ByProblem, Resolver, Streamed
 from scenarios.world.spheres import Spheres
 from scenarios.world.stepping import StepReport
 from solvers import SOLVERS, ImpactProblem, ProblemError, Solver
+
+Law = TypeVar("Law", Solver, Streamed)
 
 STREAMED: dict[str, Streamed] = {
     "qce-lcp-accurate": Streamed(max_sweeps=2_000),
@@ -199,15 +202,15 @@ def _resolver(solver: str | Solver | Streamed) -> Resolver:
         return solver
     if not isinstance(solver, str):
         return ByProblem(solver)
-    if solver in STREAMED:
-        return STREAMED[solver]
     name, _, settings = solver.partition(":")
+    if name in STREAMED:
+        return _with_settings(partial(replace, STREAMED[name]), settings)
     if name in SOLVERS:
         return ByProblem(_with_settings(SOLVERS[name], settings))
     raise ProblemError(f"solver must be one of {', '.join(sorted([*SOLVERS, *STREAMED]))}, not {solver!r}")
 
 
-def _with_settings(law: Callable[..., Solver], settings: str) -> Solver:
+def _with_settings(law: Callable[..., Law], settings: str) -> Law:
     """A solver with numbers for some of its settings: "tolerance=1e-6,max_sweeps=500"."""
     pairs = (pair.partition("=") for pair in settings.split(",") if pair)
     try:

@@ -90,7 +90,8 @@ class RigidImpact:
             v_pre=_read_only(self.velocity.ravel()), J=J, D=D, JM=JM, DM=DM,
             inverse_mass=_csr((start, diagonal, inverse_mass[diagonal]), n),
             restitution=_read_only(self.restitution), friction=_read_only(self.friction),
-            stiffness=_read_only(np.ones(m)), has_friction=has_friction,
+            stiffness=_read_only(np.ones(m)), tangential_restitution=_read_only(np.zeros(m)),
+            has_friction=has_friction,
             W_diagonal=_read_only(_diagonal(self.contacts.body, self.rows.block, self.inverse_mass)),
             u_pre=_read_only(self.rows.u),
         )  # fmt: skip

@@ -61,6 +61,8 @@ OFF = 0.01
 # A layer of 15,000 grains for what takes long and does not depend on the size.
 SMALLER = 50
 PATTERN_CYCLES = 30
+# Tangential restitution of Bizon 1998.
+BIZON = 0.35
 # The bed of `granular-shake` lies from here on [√(D/g)]; so many steps are measured.
 LYING = 25.0
 LYING_STEPS = 40
@@ -94,7 +96,11 @@ def settled(pattern: str, restitution: float | None, side: int) -> bytes:
 
 
 def started(pattern: str, restitution: float | None, side: int) -> World:
-    world = extended_pattern(pattern=pattern, restitution=restitution, side=side).world()
+    # Zhang 2015, whose restitution is the same at all speeds, has no tangential restitution.
+    rebound = BIZON if restitution is None else 0.0
+    world = extended_pattern(
+        pattern=pattern, restitution=restitution, side=side, tangential_restitution=rebound
+    ).world()
     assert isinstance(world, World)
     return world
 
