@@ -467,7 +467,11 @@ def _write_comparison(runs: dict[str, Path], out: Path, scene: MovingScene) -> N
     "--out", type=click.Path(file_okay=False, path_type=Path), default=Path("patterns"), show_default=True,
     help="Folder of the records.",
 )  # fmt: skip
-def patterns(runs: tuple[Path, ...], out: Path) -> None:
+@click.option(
+    "--beside", type=click.Path(exists=True, file_okay=False, path_type=Path),
+    help="Folder of records with other settings, whose last maps a table sets beside these.",
+)  # fmt: skip
+def patterns(runs: tuple[Path, ...], out: Path, beside: Path | None) -> None:
     """Keep the height maps of extended-pattern runs; then write table and figures of all that are kept.
 
     Each RUN is a results folder of `simulate`; what it has to show goes into one small file in OUT, in place of an
@@ -477,6 +481,7 @@ def patterns(runs: tuple[Path, ...], out: Path) -> None:
     Examples:
       impactbench patterns hexagons squares
       impactbench patterns
+      impactbench patterns --beside patterns/no-tangential-restitution
     """  # noqa: D301
     with _explained_errors():
         from harness.patterns import read_record, record_of_run, write_record
@@ -487,7 +492,8 @@ def patterns(runs: tuple[Path, ...], out: Path) -> None:
         for run in runs:
             record = record_of_run(run)
             _say(f"written: {write_record(out / f'{record.pattern}.npz', record)}")
-        written = write_patterns([read_record(path) for path in sorted(out.glob("*.npz"))], out)
+        others = [] if beside is None else [read_record(path) for path in sorted(beside.glob("*.npz"))]
+        written = write_patterns([read_record(path) for path in sorted(out.glob("*.npz"))], out, others)
         click.echo((out / "patterns.md").read_text(encoding="utf-8"))
         click.echo("written: " + ", ".join(str(path) for path in written))
 

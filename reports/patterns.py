@@ -56,12 +56,13 @@ TABLE_2_NOTE = (
 )
 
 
-def write_patterns(records: Sequence[PatternRecord], folder: Path) -> list[Path]:
+def write_patterns(records: Sequence[PatternRecord], folder: Path, others: Sequence[PatternRecord] = ()) -> list[Path]:
     """Write the page and the figures of some runs.
 
     Args:
         records: one for each pattern.
         folder: where to.
+        others: of runs with other settings, to be set beside these.
 
     Raises:
         ReportError: there is no record, or the folder cannot be written to.
@@ -70,7 +71,7 @@ def write_patterns(records: Sequence[PatternRecord], folder: Path) -> list[Path]
         raise ReportError(f"{folder} holds no records of patterns; name results folders of extended-pattern runs")
     ordered = sorted(records, key=lambda record: list(DRIVING).index(record.pattern))
     path = prepare(folder)
-    written = [write_whole(path / "patterns.md", patterns_markdown(ordered).encode())]
+    written = [write_whole(path / "patterns.md", patterns_markdown(ordered, others).encode())]
     with mpl.rc_context(STYLE):
         written += save(_panels_figure(ordered), path, "patterns")
         written += save(_growth_figure(ordered), path, "pattern_growth")
@@ -78,8 +79,8 @@ def write_patterns(records: Sequence[PatternRecord], folder: Path) -> list[Path]
     return written
 
 
-def patterns_markdown(records: Sequence[PatternRecord]) -> str:
-    """All runs as one Markdown page."""
+def patterns_markdown(records: Sequence[PatternRecord], others: Sequence[PatternRecord] = ()) -> str:
+    """All runs as one Markdown page, and the last maps of others with other settings."""
     lines = [
         "# Patterns of vibrated layers",
         "",
@@ -103,6 +104,7 @@ def patterns_markdown(records: Sequence[PatternRecord]) -> str:
         "",
         f"A pattern stands from the cycle on from which all later maps pass its thresholds: {_thresholds()}.",
         "",
+        *_beside_lines(records, others),
         *_faultless_lines(records),
         "## Beside Table 2 of Zhang 2015",
         "",
@@ -133,16 +135,51 @@ def standing_since(record: PatternRecord) -> int | None:
 def _comparison_rows(record: PatternRecord) -> Iterator[tuple[str, ...]]:
     """The last map beside the published panel."""
     panel, last = PUBLISHED[record.pattern], record.tenths - 1
-    if record.pattern == "flat":
-        stands = "none is expected"
-    else:
-        since = standing_since(record)
-        stands = f"from cycle {since} on" if since is not None else "no"
-    yield record.pattern, "here", str(record.cycles[last]), *_numbers(record.measures[last]), stands
+    yield record.pattern, "here", str(record.cycles[last]), *_numbers(record.measures[last]), _stands(record)
     if last < len(record.cycles) - 1:
         yield "", "here, the other phase", str(record.cycles[-1]), *_numbers(record.measures[-1]), ""
     published = (f"{value:.3f}" for value in (panel.q2, panel.q4, panel.q6))
     yield "", "Bizon 1998", str(panel.cycles or "–"), f"{panel.wavelength or '–'}", *published, "–", "–", "–", "–", ""
+
+
+def _stands(record: PatternRecord) -> str:
+    """Since when the pattern stands, in words."""
+    if record.pattern == "flat":
+        return "none is expected"
+    since = standing_since(record)
+    if since is not None:
+        return f"from cycle {since} on"
+    showing = sum(shows(record.pattern, named_measures(found)) for found in record.measures[: record.tenths])
+    return f"no; in {showing} of {record.tenths} maps"
+
+
+def _beside_lines(records: Sequence[PatternRecord], others: Sequence[PatternRecord]) -> Iterator[str]:
+    """Runs of the same patterns with other settings."""
+    other = {record.pattern: record for record in others}
+    rows = [row for record in records if record.pattern in other for row in _beside_rows(record, other[record.pattern])]
+    if not rows:
+        return
+    yield from (
+        "## Beside other settings",
+        "",
+        "The last maps of runs whose settings differ as said, and the first cycle after which none of the maps misses "
+        "the pattern.",
+        "",
+        *markdown_table(("pattern", "settings", "cycle", *MEASURES.values(), "pattern stands"), rows),
+        "",
+    )
+
+
+def _beside_rows(record: PatternRecord, other: PatternRecord) -> Iterator[tuple[str, ...]]:
+    """A run and another one, each by what it has that the other has not."""
+    own, its = (set(str(run.run["scene"]).partition(":")[2].split(",")) for run in (record, other))
+    named = {setting.partition("=")[0] for setting in its}
+    for name, run, differs in (
+        (record.pattern, record, own - its),
+        ("", other, (its - own) | {f"no {s.partition('=')[0]}" for s in own if s.partition("=")[0] not in named}),
+    ):
+        last = run.tenths - 1
+        yield name, ", ".join(sorted(differs)), str(run.cycles[last]), *_numbers(run.measures[last]), _stands(run)
 
 
 def _faultless_lines(records: Sequence[PatternRecord]) -> Iterator[str]:

@@ -89,6 +89,21 @@ def test_the_page_sets_each_run_beside_the_published_panel() -> None:
     assert "## Patterns without a fault" not in patterns_markdown([record("flat", waves(1))])
 
 
+def test_runs_with_other_settings_stand_beside_each_other_by_what_differs() -> None:
+    scene = "extended-pattern:pattern=squares,friction=0.5"
+    plain, other = (
+        PatternRecord({**FACTS, "pattern": "squares", "scene": text}, np.array([10]), waves(2)[None])
+        for text in (scene, f"{scene},tangential_restitution=0.35")
+    )
+    page = patterns_markdown([other, record("flat", waves(1))], [plain, record("hexagons", waves(3))])
+    assert "| squares | tangential_restitution=0.35 | 10 | 25.0 |" in page
+    assert "|  | no tangential_restitution | 10 | 25.0 |" in page
+    table = page.partition("## Beside other settings")[2].partition("##")[0]
+    assert "hexagons" not in table
+    assert "flat" not in table
+    assert "## Beside other settings" not in patterns_markdown([other])
+
+
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Ten cycles of a few grains: the files of a run, whatever it shows."""
