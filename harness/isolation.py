@@ -226,6 +226,8 @@ def _start_worker() -> None:
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
     _die_with_parent()
+    # Under "fork" and "forkserver" numba's threads take a named semaphore, which a worker that is killed leaves behind.
+    multiprocessing.set_start_method("spawn", force=True)
     # What a solver prints would tear the progress display; `replay` shows it.
     sink = os.open(os.devnull, os.O_RDWR)
     for descriptor in (0, 1, 2):

@@ -234,6 +234,26 @@ def is_alive(pid: int) -> bool:
     return stat.rpartition(")")[2].split()[0] != "Z"
 
 
+def test_a_law_with_threads_leaves_nothing_behind_for_the_system_to_clean_up(
+    tmp_path: Path, user_file: Callable[[str], Path]
+) -> None:
+    user_file("""
+        class Threaded:
+            def solve(self, problem):
+                import numba
+
+                # It starts them.
+                numba.get_num_threads()
+                raise UnsupportedProblem("threads")
+    """)
+    process = start(["run", "--scenario", "three-ball-chain:va=0.5", "--solver", "my_law.py:Threaded", "--out", "out"],
+                    tmp_path)  # fmt: skip
+    _, errors = process.communicate(timeout=DEADLINE_S)
+    assert process.returncode == 0, errors
+    assert list(stored(tmp_path)["reason"]) == ["threads"]
+    assert "leaked" not in errors
+
+
 # Notes its process, and holds the run in the middle until the file "go" is there.
 HALTING = """
     from pathlib import Path
