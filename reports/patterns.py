@@ -190,10 +190,11 @@ def _faultless_lines(records: Sequence[PatternRecord]) -> Iterator[str]:
     yield from (
         "## Patterns without a fault",
         "",
-        "The recipe's measures of standing waves of the published wavelength in this box, least and largest over all "
-        "ways in which they may be turned and displaced, and where they are turned against the walls as the waves of "
-        "the last map are; in brackets what counts as the pattern. So few waves do not come to 1, and turned by some "
-        "angles three waves of squares do not count, without a fault as they are.",
+        "The recipe's measures of standing waves in this box, least and largest over all ways in which they may be "
+        "displaced: of the published wavelength, turned by any angle, and as long and turned as the waves of the last "
+        "map are (mean wave number of the strongest shell and its neighbors); in brackets what counts as the pattern. "
+        "So few waves do not come to 1; turned by some angles three waves of squares do not count, without a fault as "
+        "they are; and waves of a length between two shells lie in both, so that a shell holds some directions alone.",
         "",
         *markdown_table(
             ("pattern", "waves across", "turned by", "Q2", "Q4", "Q6"),
@@ -212,11 +213,14 @@ def _faultless_rows(record: PatternRecord) -> Iterator[tuple[str, ...]]:
     lies = f"{round(np.degrees(turn)) % (360 // fold)}°"
     names = ("Q2", "Q4", "Q6")
     bounds = [f" ({_limit(*limits[name])})" if name in limits else "" for name in names]
-    waves = f"{side / (PUBLISHED[pattern].wavelength or np.nan):.1f}"
-    for angle, words in ((None, "any angle"), (turn, lies)):
-        ranges = faultless_measures(pattern, side, angle)
+    for length, angle, words in (
+        (PUBLISHED[pattern].wavelength, None, "any angle"),
+        (found.mean_wavelength, turn, lies),
+    ):
+        ranges = faultless_measures(pattern, side, turn=angle, wavelength=length)
         between = (f"{least:.2f} - {most:.2f}" for least, most in (ranges[name] for name in names))
         marks = bounds if angle is None else ["", "", ""]
+        waves = f"{side / (length or np.nan):.1f}"
         yield pattern, waves, words, *(text + mark for text, mark in zip(between, marks, strict=True))
     here = (f"{named_measures(found)[name]:.2f}" for name in names)
     yield f"{pattern}, here at cycle {record.cycles[last]}", "", lies, *here

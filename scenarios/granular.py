@@ -182,17 +182,20 @@ TURNS, SHIFTS = 19, 4
 
 
 @cache
-def faultless_measures(pattern: str, side: float, turn: float | None = None) -> dict[str, tuple[float, float]]:
+def faultless_measures(
+    pattern: str, side: float, *, turn: float | None = None, wavelength: float | None = None
+) -> dict[str, tuple[float, float]]:
     """Least and largest Q2, Q4, Q6 of a pattern without a fault, however it is displaced.
 
     Few waves, seen through the window of the recipe, do not come to 1.
 
     Args:
-        pattern: of `DIRECTIONS`; its waves are as long as on the published panel.
+        pattern: of `DIRECTIONS`.
         side: of the box [D].
         turn: of its waves against the walls [rad]; None: any.
+        wavelength: of its waves [D]; None: as on the published panel.
     """
-    wavelength, directions = PUBLISHED[pattern].wavelength, DIRECTIONS[pattern]
+    directions, wavelength = DIRECTIONS[pattern], wavelength or PUBLISHED[pattern].wavelength
     assert wavelength is not None
     maps = (
         faultless_map(directions, side / wavelength, angle, shift)

@@ -67,6 +67,8 @@ class Pattern:
     """ψ4, order of four neighbors about the peaks (or the cells); NaN where there are too few."""
     psi6: float
     """ψ6, of six neighbors."""
+    mean_wavelength: float = np.nan
+    """Of the mean wave number of the strongest shell and its two neighbors: finer than side/1, side/2, …"""
     turns: Mapping[int, float] = field(default_factory=dict)
     """m → how far waves of m-fold order are turned against the first axis [rad], in [0, 2π/m)."""
 
@@ -112,11 +114,13 @@ def measure_pattern(heights: Floats, side: float) -> Pattern:
     power = np.abs(waves) ** 2
     k = np.fft.fftfreq(len(smooth), 1.0 / len(smooth))
     kx, ky = np.meshgrid(k, k, indexing="ij")
-    shell = np.rint(np.hypot(kx, ky)).astype(np.intp)
+    length = np.hypot(kx, ky)
+    shell = np.rint(length).astype(np.intp)
     power[0, 0] = 0.0
     strength = np.bincount(shell.ravel(), power.ravel())
     strongest = int(np.argmax(strength[1:])) + 1
-    inside = shell == strongest
+    inside, near = shell == strongest, np.abs(shell - strongest) <= 1
+    mean_number = float((power[near] * length[near]).sum() / (power[near].sum() or 1.0)) or np.nan
     angle, weight = np.arctan2(ky[inside], kx[inside]), power[inside]
     order = {m: (weight * np.exp(1j * m * angle)).sum() / (weight.sum() or 1.0) for m in (2, 4, 6)}
     q2, q4, q6 = (float(np.abs(of_m)) for of_m in order.values())
@@ -125,7 +129,9 @@ def measure_pattern(heights: Floats, side: float) -> Pattern:
     skewness = float(skew(smooth, axis=None)) if np.ptp(smooth) > FLAT * np.abs(smooth).max() else 0.0
     psi4, psi6 = _bond_order(filled if skewness >= 0.0 else -filled, len(filled) / strongest)
     share = float(strength[strongest]) / (total or 1.0)
-    return Pattern(side / strongest, share, float(smooth.std()), q2, q4, q6, skewness, psi4, psi6, turns)
+    return Pattern(
+        side / strongest, share, float(smooth.std()), q2, q4, q6, skewness, psi4, psi6, side / mean_number, turns
+    )
 
 
 def _bond_order(heights: Floats, wavelength: float) -> tuple[float, float]:

@@ -63,6 +63,13 @@ def test_the_turn_of_the_waves_is_found(directions: int, turn: float) -> None:
     assert (found - turn + 0.5 * period) % period == pytest.approx(0.5 * period, abs=0.03)
 
 
+@pytest.mark.parametrize("waves", [4.0, 4.4, 5.5, 7.3])
+@pytest.mark.parametrize("directions", [1, 2, 3])
+def test_a_wavelength_between_two_shells_is_found(directions: int, waves: float) -> None:
+    found = measure_pattern(faultless_map(directions, waves, 0.3), SIDE)
+    assert found.mean_wavelength == pytest.approx(SIDE / waves, rel=0.03)
+
+
 def test_a_shift_of_a_wavelength_changes_nothing() -> None:
     here, there = (faultless_map(1, 4.0, 0.0, shift) for shift in (0.0, 1.0))
     assert there == pytest.approx(here, abs=1e-12)
