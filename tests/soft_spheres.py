@@ -49,6 +49,8 @@ class SoftLayer:
     """e; None: max(1 - 0.3 v^(3/4), 0.7)."""
     friction: float = 0.5
     """Coefficient of all contacts."""
+    seed: int = 0
+    """Of the start."""
     time: float = 0.0
     """[√(D/g)]."""
     place: Floats = field(init=False)
@@ -63,7 +65,9 @@ class SoftLayer:
     """[D], shape (grains,)."""
 
     def __post_init__(self) -> None:
-        start = extended_pattern(pattern=self.pattern, side=self.side).world(solver="qce-lcp-fast", seed=0).spheres
+        start = (
+            extended_pattern(pattern=self.pattern, side=self.side).world(solver="qce-lcp-fast", seed=self.seed).spheres
+        )
         self.place, self.velocity, self.radius = start.position.copy(), start.velocity.copy(), start.radius.copy()
         self.spin, self.mass = np.zeros_like(self.place), 1.0 / start.motion[:-1, 3]
         self.duration = np.pi * np.sqrt(0.5 / self.stiffness)

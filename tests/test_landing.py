@@ -6,7 +6,9 @@ found, and how rough a layer is that should lie flat.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from dataclasses import replace
+from typing import TypeAlias
 
 import numpy as np
 import pytest
@@ -20,6 +22,8 @@ from tests.soft_spheres import SoftLayer, fluctuation
 # one cycle and softly in the next.
 SIDE = 20
 LANDINGS = [("flat", 3), ("flat", 4), ("hexagons", 3), ("hexagons", 4), ("squares", 3), ("squares", 4)]
+# Where each grain is struck is chance: the energy that one start leaves is off by a tenth of it, one way or the other.
+STARTS = 5
 # How near a landing is to come to that of soft spheres, and what does not come as near at the step of the patterns.
 BOUNDS = {"energy": 0.15, "height": 0.2, "speed": 0.05}
 MISSED = {
@@ -39,6 +43,13 @@ class ByApproach(SlowingRestitution):
     """The same e(v), of the approach before the impact."""
 
     by_blow = False
+
+
+Way: TypeAlias = tuple[str, SlowingRestitution | Constant, int]
+# How the restitution is found, and in how many times as many steps; others are printed for one start.
+RULES: list[Way] = [("blows", SlowingRestitution(), 1), ("approach", ByApproach(), 1)]
+OTHERS: list[Way] = [("blows", SlowingRestitution(), 4), ("approach", ByApproach(), 4), ("0.7", Constant(0.7), 1),
+          ("0.3", Constant(0.3), 1)]  # fmt: skip
 
 
 def test_two_soft_spheres_part_with_their_restitution() -> None:
@@ -73,25 +84,26 @@ def test_a_soft_sphere_that_slides_rolls_at_last() -> None:
 @pytest.mark.parametrize(("pattern", "before"), LANDINGS)
 def test_a_layer_lands_as_soft_spheres_do(pattern: str, before: int) -> None:
     period = vibration(pattern).period
-    layer = SoftLayer(pattern, SIDE, STIFFNESS)
-    layer.go(before * period)
-    start = layer.place.copy(), layer.velocity.copy(), layer.spin.copy()
-    layer.go((before + 1) * period)
-    expected = fluctuation(layer.velocity, layer.mass), *vertical(layer.place, layer.velocity, layer.mass)
-    print(f"\n{pattern}, cycle {before + 1}: energy about the mean motion [gD], height [D], speed [√(gD)]")
-    print(f"  soft spheres                   {expected[0]:.4f}  {expected[1]:6.3f}  {expected[2]:6.3f}")
-    found = {}
-    for name, restitution, finer in (
-        ("blows", SlowingRestitution(), 1), ("blows", SlowingRestitution(), 4), ("approach", ByApproach(), 1),
-        ("approach", ByApproach(), 4), ("0.7", Constant(0.7), 1), ("0.3", Constant(0.3), 1),
-    ):  # fmt: skip
-        world = landing(pattern, before, start, restitution, finer)
-        spheres = world.spheres
-        mass = 1.0 / spheres.motion[:-1, 3]
-        found[name, finer] = fluctuation(spheres.velocity, mass), *vertical(spheres.position, spheres.velocity, mass)
-        numbers = "{:.4f}  {:6.3f}  {:6.3f}".format(*found[name, finer])
-        print(f"  e of {name:8s} {round(world.period / world.settings.step):5d} steps     {numbers}")
-    blows, approach = (apart(found[name, 1], expected) for name in ("blows", "approach"))
+    expected, found = [], defaultdict(list)
+    for seed in range(STARTS):
+        layer = SoftLayer(pattern, SIDE, STIFFNESS, seed=seed)
+        layer.go(before * period)
+        start = layer.place.copy(), layer.velocity.copy(), layer.spin.copy()
+        layer.go((before + 1) * period)
+        expected.append(what_is_left(layer.place, layer.velocity, layer.mass))
+        for name, restitution, finer in RULES if seed else RULES + OTHERS:
+            spheres = landing(pattern, before, seed, start, restitution, finer).spheres
+            left = what_is_left(spheres.position, spheres.velocity, 1.0 / spheres.motion[:-1, 3])
+            found[name, finer].append(left)
+    print(
+        f"\n{pattern}, cycle {before + 1}: energy about the mean motion [gD], height [D], speed [√(gD)]; mean of starts"
+    )
+    truth = np.mean(expected, axis=0)
+    print(f"  soft spheres                   {numbers(truth)}   {STARTS} starts")
+    for (name, finer), all_left in found.items():
+        steps = finer * steps_per_cycle(pattern)
+        print(f"  e of {name:8s} {steps:5d} steps     {numbers(np.mean(all_left, axis=0))}   {len(all_left)} starts")
+    blows, approach = (apart(np.mean(found[name, 1], axis=0), truth) for name in ("blows", "approach"))
     assert {name for name, bound in BOUNDS.items() if blows[name] > bound} <= MISSED.get((pattern, before), set())
     assert max(blows.values()) < 0.3
     assert max(blows.values()) < 0.5 * max(approach.values())
@@ -99,7 +111,25 @@ def test_a_layer_lands_as_soft_spheres_do(pattern: str, before: int) -> None:
         assert all(blows[name] < approach[name] for name in BOUNDS)
 
 
-def apart(found: tuple[float, ...], expected: tuple[float, ...]) -> dict[str, float]:
+def steps_per_cycle(pattern: str) -> int:
+    """That of the pattern's own step."""
+    steps = extended_pattern(pattern=pattern, side=SIDE).steps_per_cycle
+    assert steps is not None
+    return steps
+
+
+def what_is_left(place: np.ndarray, velocity: np.ndarray, mass: np.ndarray) -> tuple[float, float, float]:
+    """Energy about the mean motion, mean height and vertical speed, weighted with the masses."""
+    height, speed = (float(np.average(vectors[:, 2], weights=mass)) for vectors in (place, velocity))
+    return fluctuation(velocity, mass), height, speed
+
+
+def numbers(left: np.ndarray) -> str:
+    """What is left, as it is printed."""
+    return "{:.4f}  {:6.3f}  {:6.3f}".format(*left)
+
+
+def apart(found: np.ndarray, expected: np.ndarray) -> dict[str, float]:
     """The energies' relative difference, and those of height [D] and speed [√(gD)]."""
     energy, height, speed = (abs(a - b) for a, b in zip(found, expected, strict=True))
     return {"energy": energy / expected[0], "height": height, "speed": speed}
@@ -107,7 +137,8 @@ def apart(found: tuple[float, ...], expected: tuple[float, ...]) -> dict[str, fl
 
 @pytest.mark.long
 def test_a_layer_lies_flat_where_it_should() -> None:
-    scene = extended_pattern(pattern="flat", side=FLAT_SIDE)
+    # With Bizon's tangential restitution waves grow more slowly, and in this time by neither rule.
+    scene = extended_pattern(pattern="flat", side=FLAT_SIDE, tangential_restitution=0.0)
     assert scene.steps_per_cycle is not None
     rough = {}
     for name, restitution in (("blows", SlowingRestitution()), ("approach", ByApproach())):
@@ -124,14 +155,14 @@ def test_a_layer_lies_flat_where_it_should() -> None:
 
 
 def landing(
-    pattern: str, before: int, start: tuple[np.ndarray, ...], restitution: SlowingRestitution | Constant, finer: int
-) -> World:
+    pattern: str, before: int, seed: int, start: tuple[np.ndarray, ...], restitution: SlowingRestitution | Constant,
+    finer: int,
+) -> World:  # fmt: skip
     """The layer a cycle later, with so many times as many steps."""
-    steps = extended_pattern(pattern=pattern, side=SIDE).steps_per_cycle
-    assert steps is not None
+    steps = steps_per_cycle(pattern)
     # The soft spheres' friction ends slip and gives nothing back.
     scene = extended_pattern(pattern=pattern, side=SIDE, steps_per_cycle=finer * steps, tangential_restitution=0.0)
-    world = scene.world(solver="qce-lcp-fast", seed=0)
+    world = scene.world(solver="qce-lcp-fast", seed=seed)
     assert isinstance(world, World)
     motion = world.spheres.motion.copy()
     motion[:-1, :3], motion[:-1, 4:7] = start[1:]
@@ -143,8 +174,3 @@ def landing(
     for _ in range(finer * steps):
         world.step()
     return world
-
-
-def vertical(place: np.ndarray, velocity: np.ndarray, mass: np.ndarray) -> tuple[float, float]:
-    """Mean height and vertical speed, weighted with the masses."""
-    return float(np.average(place[:, 2], weights=mass)), float(np.average(velocity[:, 2], weights=mass))

@@ -17,7 +17,8 @@ and c_i is the coefficient of restitution that the laws are given; u_i is QCE's 
 that neighbors draw apart faster than it was struck gives back what it was struck with. Of one collision b = u = -u_pre,
 so that c = e(-u_pre). `pytest -m long -s tests/test_landing.py` prints how layers land beside soft spheres: with
 e(-u_pre) for all contacts the inner ones of a layer that lands lose too little unless the steps are so short that the
-contacts collide one after the other, and waves stand on a layer that Bizon 1998 saw flat.
+contacts collide one after the other; and waves stand on a layer that Bizon 1998 saw flat (where contacts that stick
+give nothing back).
 """
 
 from __future__ import annotations
