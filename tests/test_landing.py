@@ -26,12 +26,7 @@ LANDINGS = [("flat", 3), ("flat", 4), ("hexagons", 3), ("hexagons", 4), ("square
 STARTS = 5
 # How near a landing is to come to that of soft spheres, and what does not come as near at the step of the patterns.
 BOUNDS = {"energy": 0.15, "height": 0.2, "speed": 0.05}
-MISSED = {
-    ("hexagons", 3): {"energy"},
-    ("hexagons", 4): {"height"},
-    ("squares", 3): {"speed"},
-    ("squares", 4): {"speed"},
-}
+MISSED = {("hexagons", 3): {"energy"}, ("hexagons", 4): {"height"}}
 # Contacts of 0.005 √(D/g): the grains overlap by 0.01 D.
 STIFFNESS = 200_000.0
 # Of the flat control: 15,000 grains.
