@@ -81,7 +81,7 @@ def extended_pattern(
         steps_per_cycle: time steps in a period of the plate, ≥ 50; None: the fewest of at most `LONGEST_STEP`.
         restitution: of all contacts, in [0, 1]; None: e = max(1 - 0.3 v^(3/4), 0.7), v of each contact's blow.
         friction: coefficient of all contacts, ≥ 0.
-        tangential_restitution: β₀ of all contacts that stick, in [0, 1]; Zhang 2015 has none.
+        tangential_restitution: β₀ of all contacts that stick, in [0, 1]: that of Bizon 1998; Zhang 2015 has none, 0.
 
     Source: Bizon 1998; Zhang 2015, Fig. 9.
 
