@@ -150,7 +150,7 @@ def _stands(record: PatternRecord) -> str:
     if since is not None:
         return f"from cycle {since} on"
     showing = sum(shows(record.pattern, named_measures(found)) for found in record.measures[: record.tenths])
-    return f"no; in {showing} of {record.tenths} maps"
+    return f"no; it shows in {showing} of {record.tenths} maps"
 
 
 def _beside_lines(records: Sequence[PatternRecord], others: Sequence[PatternRecord]) -> Iterator[str]:
@@ -162,8 +162,8 @@ def _beside_lines(records: Sequence[PatternRecord], others: Sequence[PatternReco
     yield from (
         "## Beside other settings",
         "",
-        "The last maps of runs whose settings differ as said, and the first cycle after which none of the maps misses "
-        "the pattern.",
+        "Maps of runs whose settings differ as said, at the last cycle that both have; and since when the pattern "
+        "stands in the whole of each run.",
         "",
         *markdown_table(("pattern", "settings", "cycle", *MEASURES.values(), "pattern stands"), rows),
         "",
@@ -171,15 +171,16 @@ def _beside_lines(records: Sequence[PatternRecord], others: Sequence[PatternReco
 
 
 def _beside_rows(record: PatternRecord, other: PatternRecord) -> Iterator[tuple[str, ...]]:
-    """A run and another one, each by what it has that the other has not."""
+    """A run and another one at the same cycle, each by what it has that the other has not."""
     own, its = (set(str(run.run["scene"]).partition(":")[2].split(",")) for run in (record, other))
+    last = min(record.cycles[record.tenths - 1], other.cycles[other.tenths - 1])
     named = {setting.partition("=")[0] for setting in its}
     for name, run, differs in (
         (record.pattern, record, own - its),
         ("", other, (its - own) | {f"no {s.partition('=')[0]}" for s in own if s.partition("=")[0] not in named}),
     ):
-        last = run.tenths - 1
-        yield name, ", ".join(sorted(differs)), str(run.cycles[last]), *_numbers(run.measures[last]), _stands(run)
+        found = run.measures[int(np.searchsorted(run.cycles, last))]
+        yield name, ", ".join(sorted(differs)), str(last), *_numbers(found), _stands(run)
 
 
 def _faultless_lines(records: Sequence[PatternRecord]) -> Iterator[str]:

@@ -92,12 +92,16 @@ def test_the_page_sets_each_run_beside_the_published_panel() -> None:
 def test_runs_with_other_settings_stand_beside_each_other_by_what_differs() -> None:
     scene = "extended-pattern:pattern=squares,friction=0.5"
     plain, other = (
-        PatternRecord({**FACTS, "pattern": "squares", "scene": text}, np.array([10]), waves(2)[None])
-        for text in (scene, f"{scene},tangential_restitution=0.35")
+        PatternRecord({**FACTS, "pattern": "squares", "scene": text}, np.array(cycles), np.array(maps))
+        for text, cycles, maps in (
+            (scene, [10], [waves(2)]),
+            (f"{scene},tangential_restitution=0.35", [10, 20], [waves(2), waves(1)]),
+        )
     )
     page = patterns_markdown([other, record("flat", waves(1))], [plain, record("hexagons", waves(3))])
     assert "| squares | tangential_restitution=0.35 | 10 | 25.0 |" in page
     assert "|  | no tangential_restitution | 10 | 25.0 |" in page
+    assert "no; it shows in 1 of 2 maps" in page
     table = page.partition("## Beside other settings")[2].partition("##")[0]
     assert "hexagons" not in table
     assert "flat" not in table
