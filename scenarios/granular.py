@@ -50,7 +50,7 @@ SETTLED = 30.0
 # Time that they take to come to rest after it.
 AFTERWARDS = 12.0
 # Friction in a bed of many layers takes more sweeps than in a layer that flies half of the time: with the six of
-# `qce-lcp-fast` the top of the bed sinks twice as far as with 600.
+# `qce-lcp-fast` the top of the bed sinks twice as far as with 600 (the README has the command).
 SHAKE_SWEEPS = 60
 # Slower approaches than this many times what gravity gives in a step are those of grains that lie.
 RESTING = 4.0

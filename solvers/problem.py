@@ -16,7 +16,7 @@ D       D                   (2m, n)   friction pyramid directions, rows 2i and 2
 μ       friction            (m,)      coefficient of friction
 c_r     restitution         (m,)      coefficient of restitution, in [0, 1]
 k       stiffness           (m,)      relative contact stiffness; only ratios matter, read by compliant laws alone
-β₀      tangential_restitution  (m,)  what sticks parts with -β₀ D v_pre, in [0, 1] (Walton 1993); 0 in most laws
+β₀      tangential_restitution  (m,)  what sticks parts with -β₀ D v_pre, in [0, 1] (Walton 1993)
 """
 
 from __future__ import annotations

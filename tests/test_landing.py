@@ -22,7 +22,7 @@ from tests.soft_spheres import SoftLayer, fluctuation
 # one cycle and softly in the next.
 SIDE = 20
 LANDINGS = [("flat", 3), ("flat", 4), ("hexagons", 3), ("hexagons", 4), ("squares", 3), ("squares", 4)]
-# Where each grain is struck is chance: the energy that one start leaves is off by a tenth of it, one way or the other.
+# Where each grain is struck is chance: what a single start leaves scatters.
 STARTS = 5
 # How near a landing is to come to that of soft spheres, and what does not come as near at the step of the patterns.
 BOUNDS = {"energy": 0.15, "height": 0.2, "speed": 0.05}

@@ -61,7 +61,7 @@ OFF = 0.01
 # A layer of 15,000 grains for what takes long and does not depend on the size.
 SMALLER = 50
 PATTERN_CYCLES = 30
-# Tangential restitution of Bizon 1998.
+# Tangential restitution by that of the normal: Zhang 2015, with one number at all speeds, has none; else Bizon's.
 BIZON = 0.35
 # The bed of `granular-shake` lies from here on [√(D/g)]; so many steps are measured.
 LYING = 25.0
@@ -96,7 +96,6 @@ def settled(pattern: str, restitution: float | None, side: int) -> bytes:
 
 
 def started(pattern: str, restitution: float | None, side: int) -> World:
-    # Zhang 2015, whose restitution is the same at all speeds, has no tangential restitution.
     rebound = BIZON if restitution is None else 0.0
     world = extended_pattern(
         pattern=pattern, restitution=restitution, side=side, tangential_restitution=rebound
