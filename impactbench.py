@@ -493,6 +493,8 @@ def patterns(runs: tuple[Path, ...], out: Path, beside: Path | None) -> None:
             record = record_of_run(run)
             _say(f"written: {write_record(out / f'{record.pattern}.npz', record)}")
         others = [] if beside is None else [read_record(path) for path in sorted(beside.glob("*.npz"))]
+        if beside is not None and not others:
+            raise click.UsageError(f"--beside: {beside} holds no records of patterns")
         written = write_patterns([read_record(path) for path in sorted(out.glob("*.npz"))], out, others)
         click.echo((out / "patterns.md").read_text(encoding="utf-8"))
         click.echo("written: " + ", ".join(str(path) for path in written))

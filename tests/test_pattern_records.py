@@ -173,6 +173,21 @@ def test_a_folder_without_sound_records_is_named(prepare: Callable[[Path], None]
     assert "Traceback" not in output
 
 
+def test_records_beside_are_read_and_a_folder_without_any_is_named(tmp_path: Path) -> None:
+    own, other = tmp_path / "own", tmp_path / "other"
+    own.mkdir()
+    other.mkdir()
+    write_record(own / "squares.npz", record("squares", waves(2)))
+    code, said = command("--out", str(own), "--beside", str(other))
+    assert code == 2
+    assert "--beside" in said
+    assert "holds no records of patterns" in said
+    write_record(other / "squares.npz", record("squares", waves(1)))
+    code, said = command("--out", str(own), "--beside", str(other))
+    assert code == 0, said
+    assert "## Beside other settings" in said
+
+
 def test_a_run_too_short_for_a_map_is_refused_with_what_to_do(tmp_path: Path) -> None:
     scene = choose_moving("extended-pattern:side=4,steps_per_cycle=300")
     specification, law = choose_resolver("qce-lcp-fast")
